@@ -1,0 +1,148 @@
+"""Configuration: frozen, typed, unknown keys rejected, never silently repaired.
+
+Lengths that act on an image are fractions of its diagonal or of its sides, so that a setting survives a change of
+image size. The resolved configuration is saved beside every result.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
+
+from viflow_anomaly.errors import ConfigError
+
+
+class FrozenConfig(BaseModel):
+    """Base of all configuration sections: immutable, strict about keys, finite numbers only."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @classmethod
+    def from_mapping(cls, values: object, *, where: str) -> Self:
+        """Validate a mapping read from a file or a request.
+
+        Raises:
+            ConfigError: code ``config_invalid``; names every key at fault and ``where`` it came from.
+        """
+        try:
+            return cls.model_validate(values)
+        except ValidationError as err:
+            first = err.errors()[0]["loc"]
+            raise ConfigError(
+                f"{where}: " + describe_validation(err), code="config_invalid", field=".".join(map(str, first)) or None
+            ) from err
+
+
+def describe_validation(err: ValidationError) -> str:
+    """One line a person can act on: every field at fault, what is wrong, what was found."""
+    parts = []
+    for problem in err.errors():
+        place = ".".join(str(step) for step in problem["loc"]) or "(root)"
+        found = "" if problem["type"] == "missing" else f", found {problem.get('input')!r:.80}"
+        parts.append(f"{place}: {problem['msg']}{found}")
+    return "; ".join(parts)
+
+
+class ImageLimits(FrozenConfig):
+    """Checked on the header, before anything is decoded."""
+
+    max_bytes: PositiveInt = 32 * 1024 * 1024
+    max_pixels: PositiveInt = 16 * 1024 * 1024
+
+
+class ViewConfig(FrozenConfig):
+    """Which part of the image a network sees, and at which scale.
+
+    ``whole``: the whole image is resampled to a pinhole view of focal length ``focal_px`` without distortion when the
+    camera is known, else shrunk to ``max_width`` (never enlarged). ``center_crop``: the paper's middle crop of
+    ``crop_size`` pixels, not resampled.
+    """
+
+    mode: Literal["whole", "center_crop"] = "whole"
+    focal_px: PositiveFloat = 232.0
+    max_width: PositiveInt = 416
+    max_height: PositiveInt = 416
+    crop_size: PositiveInt = 224
+
+
+class MotionWindowConfig(FrozenConfig):
+    """How IMU samples become the fixed window that a network eats.
+
+    ``paper_euroc`` (50x6) and ``paper_kitti`` (20x6) are the paper's layouts of raw samples [Datasets]. ``resampled``
+    takes bin means at any IMU rate: ``samples_before`` bins over ``before_s`` seconds ahead of the source frame, then
+    ``samples_between`` bins over the frame interval. ``axes``: ``sensor`` leaves the vectors in the IMU frame,
+    ``camera`` rotates them into the camera frame where ``T_cam_imu`` is known.
+    """
+
+    layout: Literal["resampled", "paper_euroc", "paper_kitti"] = "resampled"
+    axes: Literal["sensor", "camera"] = "camera"
+    before_s: PositiveFloat = 0.05
+    samples_before: PositiveInt = 4
+    samples_between: PositiveInt = 12
+
+    @property
+    def rows(self) -> int:
+        """T of the [T, 6] window."""
+        fixed = {"paper_euroc": 50, "paper_kitti": 20}
+        return fixed.get(self.layout, self.samples_before + self.samples_between)
+
+
+class ModelConfig(FrozenConfig):
+    """What the builder needs to make a network; saved in its checkpoint."""
+
+    preset: Literal["paper", "compact"] = "compact"
+    hypotheses: Literal[1, 4, 8] = 8
+    view: ViewConfig = ViewConfig()
+    motion_window: MotionWindowConfig = MotionWindowConfig()
+
+
+class RegionConfig(FrozenConfig):
+    """From residual map to labelled regions; see ``regions.py`` for each step.
+
+    Fractions are of the image diagonal unless the name says otherwise; the residual is in gray levels 0-255.
+    """
+
+    smoothing_fraction: float = Field(default=0.003, ge=0, le=0.1)
+    threshold_mads: PositiveFloat = 6.0
+    min_residual_gray: float = Field(default=12.0, ge=0, le=255)
+    opening_fraction: float = Field(default=0.004, ge=0, le=0.1)
+    closing_fraction: float = Field(default=0.012, ge=0, le=0.1)
+    min_area_fraction: float = Field(default=0.0006, ge=0, le=1, description="of the image's area")
+    max_regions: PositiveInt = 64
+    min_x_extent_fraction: float = Field(default=0.025, ge=0, le=1, description="of the diagonal: narrower is a band")
+    min_y_extent_fraction: float = Field(default=0.025, ge=0, le=1, description="of the diagonal: narrower is a band")
+    max_aspect_ratio: float = Field(default=5.0, ge=1, description="a longer bounding box is a band")
+
+
+class DetectorConfig(FrozenConfig):
+    """Everything a detection depends on besides the weights and the pair."""
+
+    regions: RegionConfig = RegionConfig()
+    include_masks: bool = False
+    min_texture_gray: float = Field(default=2.0, ge=0, description="standard deviation below which nothing is judged")
+    max_exposure_jump_gray: float = Field(default=40.0, ge=0, description="change of the mean between the frames")
+
+
+class TrainingConfig(FrozenConfig):
+    """One training run; the seed fixes everything on a CPU."""
+
+    steps: PositiveInt = 20_000
+    batch_size: PositiveInt = 16
+    learning_rate: PositiveFloat = 1e-3
+    warmup_steps: int = Field(default=500, ge=0)
+    weight_decay: float = Field(default=1e-4, ge=0)
+    gradient_clip: PositiveFloat = 1.0
+    loss: Literal["squared", "charbonnier"] = "charbonnier"
+    relaxation: float = Field(default=0.05, ge=0, lt=1, description="weight of the mean over hypotheses")
+    look_aheads: tuple[int, ...] = (1, 2)
+    seed: int = 0
+    validate_every: PositiveInt = 1000
+    checkpoint_every: PositiveInt = 500
+    threads: PositiveInt = 1
+
+    @model_validator(mode="after")
+    def _look_aheads_in_range(self) -> Self:
+        if not self.look_aheads or not all(1 <= step <= 4 for step in self.look_aheads):
+            raise ValueError(f"look_aheads: expected steps between 1 and 4, found {list(self.look_aheads)}")
+        return self
