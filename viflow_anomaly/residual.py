@@ -1,0 +1,59 @@
+"""Reconstruct the source image from the target, and how far the two differ: |I_r - I_i| in gray levels.
+
+Sampling is bilinear at pixel coordinates (pixel centres at integers), as in the network's training, but at the source
+image's own size. Coordinates beyond the target image are answered with ``inside`` False and a residual of 0.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from viflow_anomaly.errors import TooLargeError
+from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.sensor_data import Uint8Array
+
+MAX_SIDE_PX = 32767
+"""cv2.remap addresses pixels with signed 16-bit integers."""
+BOUNDARY_TOLERANCE_PX = 1e-3
+"""float32 coordinates a thousand pixels from the origin carry errors of 1e-4; such a coordinate is still inside."""
+
+
+def reconstruct(target: Uint8Array, target_coordinates: Float32Array) -> tuple[Float32Array, NDArray[np.bool_]]:
+    """Sample the target image where each source pixel is predicted to have gone.
+
+    Args:
+        target: [H, W] uint8 gray image I_i+1.
+        target_coordinates: [h, w, 2] float32, (u, v) in target pixels for every source pixel. NaN is outside.
+
+    Returns:
+        reconstruction [h, w] float32 in gray levels (0 where outside) and inside [h, w]: the coordinate lies between
+        the centres of the target's corner pixels.
+
+    Raises:
+        TooLargeError: ``image_too_large``, a side beyond 32767 px (a limit of cv2.remap).
+    """
+    height, width = target.shape
+    longest = max(height, width, *target_coordinates.shape[:2])
+    if longest > MAX_SIDE_PX:
+        raise TooLargeError(
+            f"image: expected sides of at most {MAX_SIDE_PX} px, found {longest} px",
+            code="image_too_large",
+            field="image",
+        )
+    low, high = -BOUNDARY_TOLERANCE_PX, BOUNDARY_TOLERANCE_PX
+    inside = cv2.inRange(target_coordinates, (low, low), (width - 1 + high, height - 1 + high)) != 0
+    # BORDER_REPLICATE: at u = W - 1 bilinear sampling reads the pixel beyond, with weight zero.
+    sampled = cv2.remap(
+        target.astype(np.float32), target_coordinates, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    np.copyto(sampled, 0.0, where=~inside)  # not a product: a NaN coordinate samples NaN
+    return np.asarray(sampled, dtype=np.float32), inside
+
+
+def photometric_residual(source: Uint8Array, reconstruction: Float32Array, inside: NDArray[np.bool_]) -> Float32Array:
+    """|reconstruction - source| [H, W] float32 in gray levels, 0 where ``inside`` is False."""
+    difference = cv2.absdiff(source.astype(np.float32), reconstruction)
+    np.copyto(difference, 0.0, where=~inside)
+    return np.asarray(difference, dtype=np.float32)
