@@ -1,0 +1,175 @@
+"""EuRoC MAV dataset, ASL layout (Burri et al., IJRR 2016).
+
+```
+mav0/
+  cam0/
+    data.csv          #timestamp [ns],filename
+    data/*.png
+    sensor.yaml       intrinsics, distortion, T_BS (optional: without it the camera is unknown)
+  imu0/
+    data.csv          #timestamp [ns],w_x,w_y,w_z [rad/s],a_x,a_y,a_z [m/s^2]
+    sensor.yaml       T_BS (optional: without it the mounting is unknown)
+```
+
+``T_BS`` maps sensor coordinates to the body, so ``T_cam_imu = inv(T_BS_cam) @ T_BS_imu``. A ``timeshift_cam_imu`` in
+the camera's file (Kalibr's key, seconds, t_imu = t_cam + shift) is honoured; EuRoC itself has none.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from viflow_anomaly.config import ImageLimits
+from viflow_anomaly.datasets.recording import FileRecording
+from viflow_anomaly.datasets.tables import read_frame_list, read_stamped_numbers, read_text
+from viflow_anomaly.errors import DatasetError, InvalidInputError
+from viflow_anomaly.imu_log import ImuLog
+from viflow_anomaly.sensor_data import Float64Array, PinholeCamera
+
+NEEDS = "mav0/ (or its content) with imu0/data.csv and cam*/data.csv"
+DISTORTION_NAMES = {
+    "radial-tangential": "radtan",
+    "radtan": "radtan",
+    "equidistant": "equidistant",
+    "none": "none",
+}
+IMU_COLUMNS = ("timestamp", "w_x", "w_y", "w_z", "a_x", "a_y", "a_z")
+
+
+def find_root(path: Path) -> Path | None:
+    """The folder that holds cam0 and imu0: ``path`` or ``path/mav0``; None when neither does."""
+    for root in (path / "mav0", path):
+        if (root / "imu0" / "data.csv").is_file() and _cameras(root):
+            return root
+    return None
+
+
+def open_euroc(root: Path, *, camera: str | None, limits: ImageLimits) -> FileRecording:
+    """Open the folder that ``find_root`` found.
+
+    Args:
+        root: holds ``imu0`` and the cameras.
+        camera: ``cam0``, ``cam1``, ...; None takes the first.
+        limits: on every image.
+
+    Raises:
+        DatasetError: ``camera_unknown``, ``csv_malformed``, ``timestamps_not_increasing``, ``image_missing``,
+            ``yaml_malformed``, ``calibration_malformed``.
+    """
+    chosen = camera or _cameras(root)[0]
+    if chosen not in _cameras(root):
+        raise DatasetError(
+            f"{root}: expected one of {', '.join(_cameras(root))}, found camera {chosen!r}", code="camera_unknown"
+        )
+    folder = root / chosen
+    stamps, paths = read_frame_list(folder / "data.csv", ("timestamp", "filename"), folder / "data", header="comment")
+    imu_stamps, values = read_stamped_numbers(root / "imu0" / "data.csv", IMU_COLUMNS, header="comment")
+    return FileRecording(
+        name=(root.resolve().parent if root.resolve().name == "mav0" else root.resolve()).name,
+        root=root,
+        format="euroc",
+        camera=read_camera(folder / "sensor.yaml", root / "imu0" / "sensor.yaml"),
+        imu=ImuLog(imu_stamps, values[:, :3], values[:, 3:]),
+        frame_timestamps_ns=stamps,
+        frame_paths=tuple(paths),
+        limits=limits,
+    )
+
+
+def _cameras(root: Path) -> list[str]:
+    return sorted(folder.parent.name for folder in root.glob("cam*/data.csv"))
+
+
+def read_camera(cam_yaml: Path, imu_yaml: Path) -> PinholeCamera | None:
+    """Calibration from the two ``sensor.yaml``; None without the camera's, ``T_cam_imu`` None without the IMU's.
+
+    Raises:
+        DatasetError: ``yaml_malformed``, ``calibration_malformed``.
+    """
+    if not cam_yaml.is_file():
+        return None
+    sensor = _read_yaml(cam_yaml)
+    if sensor.get("camera_model", "pinhole") != "pinhole":
+        raise _malformed(cam_yaml, f"camera_model: expected pinhole, found {sensor['camera_model']!r:.40}")
+    distortion = sensor.get("distortion_model", "none")
+    model: Any = DISTORTION_NAMES.get(distortion) if isinstance(distortion, str) else None
+    if model is None:
+        known = ", ".join(DISTORTION_NAMES)
+        raise _malformed(cam_yaml, f"distortion_model: expected one of {known}, found {distortion!r:.40}")
+    fx, fy, cx, cy = _numbers(cam_yaml, sensor, "intrinsics", 4)
+    width, height = _numbers(cam_yaml, sensor, "resolution", 2)
+    if not width.is_integer() or not height.is_integer():
+        raise _malformed(cam_yaml, f"resolution: expected whole pixels, found {width}x{height}")
+    coefficients = _numbers(cam_yaml, sensor, "distortion_coefficients", None) if model != "none" else []
+    offset = _numbers(cam_yaml, {"timeshift_cam_imu": [sensor.get("timeshift_cam_imu", 0.0)]}, "timeshift_cam_imu", 1)
+    try:
+        return PinholeCamera(
+            fx=fx,
+            fy=fy,
+            cx=cx,
+            cy=cy,
+            width=int(width),
+            height=int(height),
+            distortion_model=model,
+            distortion_coeffs=tuple(coefficients),
+            T_cam_imu=_mounting(cam_yaml, sensor, imu_yaml),
+            time_offset_s=offset[0],
+        )
+    except InvalidInputError as err:
+        raise _malformed(cam_yaml, err.message) from err
+
+
+def _mounting(cam_yaml: Path, sensor: Mapping[str, Any], imu_yaml: Path) -> Float64Array | None:
+    if not imu_yaml.is_file() or "T_BS" not in sensor:
+        return None
+    T_BS_cam = _read_T_BS(cam_yaml, sensor)
+    T_BS_imu = _read_T_BS(imu_yaml, _read_yaml(imu_yaml))
+    return np.asarray(np.linalg.inv(T_BS_cam) @ T_BS_imu)
+
+
+def _read_T_BS(path: Path, sensor: Mapping[str, Any]) -> Float64Array:
+    matrix = sensor.get("T_BS")
+    if not isinstance(matrix, Mapping):
+        raise _malformed(path, "T_BS: expected a matrix of 4 rows and 4 columns, found none")
+    T_BS = np.array(_numbers(path, matrix, "data", 16)).reshape(4, 4)
+    if not np.allclose(T_BS[:3, :3] @ T_BS[:3, :3].T, np.eye(3), atol=1e-3):
+        raise _malformed(path, "T_BS: expected a rigid transform, found a matrix whose rotation is not orthonormal")
+    return T_BS
+
+
+def _read_yaml(path: Path) -> Mapping[str, Any]:
+    # EuRoC's imu0/sensor.yaml has OpenCV's "%YAML:1.0", which is no valid YAML directive.
+    text = re.sub(r"^%YAML.*$", "", read_text(path), flags=re.MULTILINE)
+    try:
+        content = yaml.safe_load(text)
+    except yaml.YAMLError as err:
+        mark = getattr(err, "problem_mark", None)
+        line = "" if mark is None else f", line {mark.line + 1}"
+        problem = getattr(err, "problem", None) or "unreadable text"
+        raise DatasetError(f"{path}{line}: expected YAML, found: {problem}", code="yaml_malformed") from err
+    if not isinstance(content, Mapping):
+        raise DatasetError(f"{path}: expected YAML keys, found {type(content).__name__}", code="yaml_malformed")
+    return content
+
+
+def _numbers(path: Path, mapping: Mapping[str, Any], name: str, count: int | None) -> list[float]:
+    values = mapping.get(name)
+    try:
+        # YAML 1.1 reads 1e-5 (no point) as a string, hence float() and no check of the type.
+        numbers = [float(value) for value in values] if isinstance(values, list) else None
+    except (TypeError, ValueError):
+        numbers = None
+    if numbers is None or (count is not None and len(numbers) != count) or not np.isfinite(numbers).all():
+        wanted = "a list of finite" if count is None else f"{count} finite"
+        raise _malformed(path, f"{name}: expected {wanted} numbers, found {values!r:.80}")
+    return numbers
+
+
+def _malformed(path: Path, problem: str) -> DatasetError:
+    return DatasetError(f"{path}: {problem}", code="calibration_malformed")

@@ -1,0 +1,117 @@
+"""What every reader returns: frames by index, one IMU log, the camera when it is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from viflow_anomaly.config import ImageLimits
+from viflow_anomaly.errors import DatasetError
+from viflow_anomaly.images import read_image
+from viflow_anomaly.imu_log import ImuLog
+from viflow_anomaly.sensor_data import Float64Array, Frame, Int64Array, PinholeCamera
+
+
+class Recording(Protocol):
+    """Camera frames and IMU samples of one drive or flight, with random access."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def root(self) -> Path:
+        """The folder that was read."""
+        ...
+
+    @property
+    def format(self) -> str:
+        """Its key in ``registry.READERS``."""
+        ...
+
+    @property
+    def camera(self) -> PinholeCamera | None:
+        """Calibration of the images as they are stored, or None when the recording has none."""
+        ...
+
+    @property
+    def frame_timestamps_ns(self) -> Int64Array:
+        """[F] strictly increasing, in the camera's clock."""
+        ...
+
+    @property
+    def imu(self) -> ImuLog:
+        """Stamps in the IMU's clock: t_imu = t_cam + camera.time_offset_s."""
+        ...
+
+    def __len__(self) -> int:
+        """F, the number of frames."""
+        ...
+
+    def frame(self, index: int) -> Frame:
+        """Decode frame ``index`` (negative counts from the end).
+
+        Raises:
+            IndexError: outside the recording.
+            DatasetError: ``image_missing``.
+            InvalidInputError: as ``images.read_image`` and ``Frame``.
+        """
+        ...
+
+    def frame_path(self, index: int) -> Path: ...
+
+    def motor_command(self, index: int) -> Float64Array | None:
+        """[M] the platform's command or speed at frame ``index``, or None where the recording has none."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class FileRecording:
+    """A recording of image files; the readers of all formats build this.
+
+    Args:
+        name, root, format, camera, imu: as in ``Recording``.
+        frame_timestamps_ns: [F] int64, strictly increasing.
+        frame_paths: F image files.
+        motor_commands: [F, M] or None.
+        limits: on every image that is decoded.
+
+    Raises:
+        DatasetError: ``no_frames``.
+    """
+
+    name: str
+    root: Path
+    format: str
+    camera: PinholeCamera | None
+    imu: ImuLog
+    frame_timestamps_ns: Int64Array
+    frame_paths: tuple[Path, ...]
+    motor_commands: Float64Array | None = None
+    limits: ImageLimits = field(default_factory=ImageLimits)
+
+    def __post_init__(self) -> None:
+        if not self.frame_paths:
+            raise DatasetError(f"{self.root}: expected at least one frame, found none", code="no_frames")
+        assert len(self.frame_paths) == self.frame_timestamps_ns.size
+        assert (np.diff(self.frame_timestamps_ns) > 0).all()
+        assert self.motor_commands is None or len(self.motor_commands) == len(self.frame_paths)
+
+    def __len__(self) -> int:
+        return len(self.frame_paths)
+
+    def frame(self, index: int) -> Frame:
+        path = self.frame_path(index)
+        image = read_image(path, limits=self.limits, field="image")
+        return Frame(int(self.frame_timestamps_ns[index]), image)
+
+    def frame_path(self, index: int) -> Path:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"{self.name}: frame {index} of {len(self)}")
+        return self.frame_paths[index]
+
+    def motor_command(self, index: int) -> Float64Array | None:
+        self.frame_path(index)
+        return None if self.motor_commands is None else np.asarray(self.motor_commands[index])
