@@ -84,9 +84,9 @@ def _check_names(path: Path, first: TextLine | None, columns: Sequence[str]) -> 
         raise csv_malformed(path, 1 if first is None else first.number, f"expected {','.join(columns)}, found {found}")
 
 
-def parse_integer_ns(path: Path, line: int, cell: str) -> int:
+def parse_integer_ns(path: Path, line: int, cell: str, *, lowest: int = 0) -> int:
     """Nanoseconds written as an integer; a float would have lost digits already, so it is refused."""
-    if not re.fullmatch(r"[0-9]{1,19}", cell) or int(cell) > MAX_TIMESTAMP_NS:
+    if not re.fullmatch(r"-?[0-9]{1,19}", cell) or not lowest <= int(cell) <= MAX_TIMESTAMP_NS:
         raise csv_malformed(path, line, f"expected a timestamp in whole nanoseconds, found {cell[:40]!r}")
     return int(cell)
 
@@ -113,7 +113,8 @@ def read_stamped_numbers(path: Path, columns: Sequence[str], *, header: str) -> 
     """
     stamps, rows = [], []
     for line, cells in read_csv(path, columns, header=header):
-        stamps.append(parse_integer_ns(path, line, cells[0]))
+        # An IMU may have run before the clock's zero (odometry counts from its first frame); a frame may not.
+        stamps.append(parse_integer_ns(path, line, cells[0], lowest=-MAX_TIMESTAMP_NS))
         rows.append(parse_numbers(path, line, cells[1:]))
     if not rows:
         raise csv_malformed(path, 1, f"expected rows of {', '.join(columns)}, found none")
