@@ -1,0 +1,70 @@
+"""The body of one request, read with a limit that holds while it arrives."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import Final
+
+from starlette.requests import ClientDisconnect, Request
+
+from viflow_anomaly_service.problems import Problem
+
+DISCARD_SECONDS: Final = 2.0
+
+
+class RequestBody:
+    """Reads or discards what a client sends; holds at most the limit in memory."""
+
+    def __init__(self, request: Request) -> None:
+        self._request = request
+        self._finished = False
+
+    async def read(self, *, max_bytes: int, timeout_s: float) -> bytes:
+        """The whole body.
+
+        Args:
+            max_bytes: limit, applied to Content-Length before anything is read and to the bytes as they come.
+            timeout_s: longest upload.
+
+        Raises:
+            Problem: 413 ``body_too_large``, 408 ``body_timeout``.
+            ClientDisconnect: the client went away.
+        """
+        announced = self._request.headers.get("content-length", "")
+        if announced.isdecimal() and int(announced[:20]) > max_bytes:
+            raise _too_large(max_bytes, f"{announced[:20]} announced")
+        chunks: list[bytes] = []
+        size = 0
+        try:
+            async with asyncio.timeout(timeout_s):
+                while not self._finished:
+                    chunk = await self._next_chunk()
+                    size += len(chunk)
+                    if size > max_bytes:
+                        raise _too_large(max_bytes, "more")
+                    chunks.append(chunk)
+        except TimeoutError as err:
+            detail = f"expected the whole body within {timeout_s:g} s, found {size} bytes of it"
+            raise Problem(408, code="body_timeout", detail=detail) from err
+        return b"".join(chunks)
+
+    async def discard(self) -> None:
+        """Swallow the rest for a moment: a client that is still sending would else see a reset, not the answer."""
+        with contextlib.suppress(TimeoutError, ClientDisconnect):
+            async with asyncio.timeout(DISCARD_SECONDS):
+                while not self._finished:
+                    await self._next_chunk()
+
+    async def _next_chunk(self) -> bytes:
+        message = await self._request.receive()
+        if message["type"] == "http.disconnect":
+            self._finished = True
+            raise ClientDisconnect
+        self._finished = not message.get("more_body", False)
+        chunk: bytes = message.get("body", b"")
+        return chunk
+
+
+def _too_large(max_bytes: int, found: str) -> Problem:
+    return Problem(413, code="body_too_large", detail=f"expected a body of at most {max_bytes} bytes, found {found}")

@@ -1,0 +1,72 @@
+"""What the service can be told: keyword arguments over the environment (``VIFLOW_...``) over the defaults here."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from viflow_anomaly.config import DetectorConfig, ImageLimits, describe_validation
+from viflow_anomaly.errors import ConfigError
+
+MEBIBYTE = 1024 * 1024
+
+
+def _usable_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class ServiceSettings(BaseSettings):
+    """Settings of one service process; ``VIFLOW_PORT=9000`` or ``VIFLOW_DETECTOR__REGIONS__THRESHOLD_MADS=8``.
+
+    Build it with :func:`load_settings`, whose error names the variable at fault.
+    """
+
+    model_config = SettingsConfigDict(
+        env_prefix="VIFLOW_", env_nested_delimiter="__", frozen=True, extra="forbid", allow_inf_nan=False
+    )
+
+    checkpoint: Path | None = Field(default=None, description="model to load; the bundled one when not given")
+    device: str = "cpu"
+    detector: DetectorConfig = DetectorConfig()
+    host: str = "127.0.0.1"
+    port: int = Field(default=8000, ge=0, le=65535, description="0 takes a free one, named in the log")
+    max_image_bytes: PositiveInt = 16 * MEBIBYTE
+    max_image_pixels: PositiveInt = 16 * MEBIBYTE
+    max_body_bytes: PositiveInt = 48 * MEBIBYTE
+    max_imu_samples: PositiveInt = 20_000
+    threads: PositiveInt = Field(default=1, description="torch and OpenCV threads of one detection")
+    max_concurrent: PositiveInt = Field(default_factory=_usable_cores, description="detections running at once")
+    max_queued: NonNegativeInt = Field(default=32, description="requests that may wait or upload beside them")
+    queue_timeout_s: PositiveFloat = Field(default=10.0, description="longest wait for a turn")
+    body_timeout_s: PositiveFloat = Field(default=30.0, description="longest upload")
+    shutdown_timeout_s: PositiveInt = Field(default=20, description="time for running requests after SIGTERM")
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+
+    @property
+    def image_limits(self) -> ImageLimits:
+        return ImageLimits(max_bytes=self.max_image_bytes, max_pixels=self.max_image_pixels)
+
+    @property
+    def max_json_values(self) -> int:
+        """Commas and opening brackets a JSON text may hold: nine for each IMU sample, and the rest of a request."""
+        return 10 * self.max_imu_samples + 4096
+
+
+def load_settings(**overrides: Any) -> ServiceSettings:
+    """Settings from the environment, with ``overrides`` (those that are not None) on top.
+
+    Raises:
+        ConfigError: ``config_invalid`` with the setting at fault.
+    """
+    given = {name: value for name, value in overrides.items() if value is not None}
+    try:
+        return ServiceSettings(**given)
+    except ValidationError as err:
+        place = ".".join(str(step) for step in err.errors()[0]["loc"])
+        raise ConfigError(
+            f"service settings: {describe_validation(err)}", code="config_invalid", field=place or None
+        ) from err
