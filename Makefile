@@ -1,0 +1,66 @@
+# make demo   a virtual environment of its own, then the main job on the bundled model and the bundled sample
+# make test   the gate: lint, format, strict types, import direction, tests with a branch-coverage floor
+# Others: lint, model, wheel, clean, distclean. Needs Python >= 3.11, make and git; fetches from package indexes only.
+
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := demo
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+# On Linux this index has the CPU build of torch (200 MB); PyPI's is a CUDA build of gigabytes.
+TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
+
+DEMO_SAMPLE ?= samples/drone
+DEMO_OUT ?= demo-output
+COVERAGE_FLOOR ?= 90
+
+.PHONY: demo test lint model wheel clean distclean
+
+$(VENV)/.torch: constraints.txt
+	python=; for name in $(PYTHON) python3.11 python3 python3.12 python3.13; do \
+	  if $$name -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; then python=$$name; break; fi; \
+	done; \
+	[[ -n "$$python" ]] || { echo "error: expected Python 3.11 or later as python3.11 or python3; name another one with: make PYTHON=/path/to/python3" >&2; exit 1; }; \
+	[[ -x $(BIN)/python ]] || "$$python" -m venv $(VENV)
+	index=; \
+	if [[ "$$(uname -s)" == Linux ]] && $(BIN)/python -c "import urllib.request as u; u.urlopen('$(TORCH_CPU_INDEX)/torch/', timeout=5)" 2>/dev/null; \
+	then index="--extra-index-url $(TORCH_CPU_INDEX)"; fi; \
+	$(PIP) install --quiet --constraint constraints.txt $$index torch
+	touch $@
+
+$(VENV)/.installed: $(VENV)/.torch pyproject.toml
+	$(PIP) install --quiet --constraint constraints.txt --editable .
+	touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+demo: $(VENV)/.installed
+	$(BIN)/viflow-anomaly batch $(DEMO_SAMPLE) --out $(DEMO_OUT) --overwrite --overlays all
+	$(BIN)/python .ci/show_demo.py $(DEMO_OUT)
+
+lint: $(VENV)/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+test: $(VENV)/.installed-dev
+	.ci/system-packages
+	$(MAKE) --no-print-directory lint
+	$(BIN)/python -m pytest --cov --cov-branch --cov-report=term --cov-fail-under=$(COVERAGE_FLOOR)
+
+wheel: $(VENV)/.installed
+	rm -rf build dist
+	$(PIP) wheel --quiet --no-deps --wheel-dir dist .
+	$(BIN)/python .ci/check_wheel.py dist/*.whl
+
+clean:
+	rm -rf build dist $(DEMO_OUT) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis .coverage
+
+distclean: clean
+	rm -rf $(VENV)

@@ -1,0 +1,138 @@
+"""``viflow-anomaly batch``: a whole recording."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from viflow_anomaly.cli.options import (
+    AsJson,
+    Assignments,
+    Checkpoint,
+    ConfigFile,
+    Device,
+    Threads,
+    load_detector,
+    settings_from,
+)
+from viflow_anomaly.cli.progress import stderr_progress
+
+if TYPE_CHECKING:
+    from viflow_anomaly.batch_job import BatchOptions, PairDetector
+    from viflow_anomaly.batch_record import BatchSummary
+    from viflow_anomaly.datasets.recording import Recording
+
+EXIT_SOME_FAILED = 3
+
+
+def _how_many(text: str) -> str:
+    if text != "all" and not text.isdecimal():
+        raise typer.BadParameter(f"expected a number or 'all', found {text!r}")
+    return text
+
+
+def batch(
+    directory: Annotated[
+        Path, typer.Argument(metavar="DIR", help="EuRoC ASL, KITTI raw, KITTI odometry or the plain layout.")
+    ],
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: DIR-detections", show_default=False)] = None,
+    layout: Annotated[
+        str | None,
+        typer.Option("--format", metavar="NAME", help="euroc, kitti_raw, kitti_odometry or plain; default by content."),
+    ] = None,
+    camera: Annotated[str | None, typer.Option(metavar="NAME", help="Which camera, e.g. cam1 or image_03.")] = None,
+    look_ahead: Annotated[int, typer.Option(min=1, max=4, help="Frames from source to target.")] = 1,
+    limit: Annotated[int | None, typer.Option(min=1, metavar="N", help="Only the first N pairs.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Do only what an earlier run left out.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
+    overlays: Annotated[
+        str, typer.Option(metavar="N|all", callback=_how_many, help="Pictures to draw, spread over the run.")
+    ] = "0",
+    video: Annotated[bool, typer.Option("--video", help="Also write overlay.mp4.")] = False,
+    masks: Annotated[bool | None, typer.Option("--masks", help="Add each region's mask (COCO RLE).")] = None,
+    as_json: AsJson = False,
+    checkpoint: Checkpoint = None,
+    threads: Threads = None,
+    device: Device = None,
+    config: ConfigFile = None,
+    assignments: Assignments = None,
+) -> int:
+    """Judge every frame pair of a recording: detections.jsonl (a ROI JSON object a line), run.json, pictures.
+
+    Exit code 3 when some pairs failed: run.json names them, the others are done. --json prints run.json.
+
+    [bold]Examples[/bold]
+
+      viflow-anomaly batch V1_01_easy/mav0 --overlays 20 --video
+
+      viflow-anomaly batch 2011_09_26/2011_09_26_drive_0005_sync --out runs/kitti-0005 --camera image_02
+
+      viflow-anomaly batch V1_01_easy/mav0 --resume
+    """
+    if resume and overwrite:
+        raise typer.BadParameter("--resume keeps what --overwrite would replace; give one of them")
+    options = {"checkpoint": checkpoint, "threads": threads, "device": device, "detector.include_masks": masks}
+    settings = settings_from(config, assignments, options)
+    from viflow_anomaly.batch_job import BatchOptions
+    from viflow_anomaly.datasets.registry import open_recording
+
+    recording = open_recording(directory, format=layout, camera=camera, limits=settings.limits)
+    batch_options = BatchOptions(
+        out_dir=out or default_out_dir(directory),
+        look_ahead=look_ahead,
+        limit=limit,
+        overlays="all" if overlays == "all" else int(overlays),
+        video=video,
+        resume=resume,
+        overwrite=overwrite,
+    )
+    detector = load_detector(settings)
+    recorded = settings.model_dump(mode="json", include={"checkpoint", "device", "threads", "limits"})
+    summary = _run(recording, detector, batch_options, recorded)
+    _report(summary, as_json=as_json)
+    return EXIT_SOME_FAILED if summary.failures else 0
+
+
+def default_out_dir(directory: Path) -> Path:
+    """``DIR-detections`` beside DIR, also where DIR is ``.`` or ends in ``..``."""
+    whole = directory.resolve() if directory.name in ("", "..") else directory
+    return whole.with_name(f"{whole.name}-detections")
+
+
+def _run(recording: Recording, detector: PairDetector, options: BatchOptions, recorded: dict[str, Any]) -> BatchSummary:
+    from viflow_anomaly.batch_job import run_batch
+
+    with stderr_progress() as progress:
+        task = progress.add_task("pairs", total=None)
+
+        def show(done: int, total: int, failed: int) -> None:
+            description = f"pairs ({failed} failed)" if failed else "pairs"
+            progress.update(task, completed=done, total=total, description=description)
+
+        try:
+            return run_batch(recording, detector, options, on_progress=show, settings=recorded)
+        except KeyboardInterrupt:
+            print(f"interrupted: what is done is kept in {options.out_dir}; go on with --resume", file=sys.stderr)
+            raise
+
+
+def _report(summary: BatchSummary, *, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(json.loads((summary.out_dir / "run.json").read_bytes())))
+        return
+    print(
+        f"{summary.pairs} pairs in {summary.wall_time_s:.1f} s: {summary.ok} ok, {summary.abstained} abstained, "
+        f"{summary.failed} failed -> {summary.out_dir}"
+    )
+    for failure in summary.failures[:5]:
+        print(f"failed: {failure.source_timestamp_ns}: {failure.message} [{failure.code}]", file=sys.stderr)
+    if summary.failed > 5:
+        print(f"failed: and {summary.failed - 5} more, see {summary.out_dir / 'run.json'}", file=sys.stderr)
+
+
+def register(app: typer.Typer) -> None:
+    app.command(no_args_is_help=True)(batch)

@@ -1,0 +1,93 @@
+"""``viflow-anomaly detect``: one image pair."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from viflow_anomaly.cli.options import (
+    AsJson,
+    Assignments,
+    Checkpoint,
+    ConfigFile,
+    Device,
+    Threads,
+    load_detector,
+    settings_from,
+)
+
+if TYPE_CHECKING:
+    from viflow_anomaly.detection import Detection
+
+
+def detect(
+    source: Annotated[Path, typer.Argument(help="The earlier image: PNG or JPEG, gray or colour.")],
+    target: Annotated[Path, typer.Argument(help="The later image, of the same size.")],
+    imu: Annotated[Path, typer.Option(metavar="FILE", help="imu.json (as POST /detect takes it) or imu.csv.")],
+    source_timestamp_ns: Annotated[
+        int | None, typer.Option(min=0, metavar="NS", help="Stamp of SOURCE; an imu.json may hold it.")
+    ] = None,
+    target_timestamp_ns: Annotated[
+        int | None, typer.Option(min=0, metavar="NS", help="Stamp of TARGET; an imu.json may hold it.")
+    ] = None,
+    camera: Annotated[Path | None, typer.Option(metavar="FILE", help="camera.json: intrinsics and mounting.")] = None,
+    overlay: Annotated[Path | None, typer.Option(metavar="PNG", help="Also draw the regions into this file.")] = None,
+    masks: Annotated[bool | None, typer.Option("--masks", help="Add each region's mask (COCO RLE).")] = None,
+    as_json: AsJson = False,
+    checkpoint: Checkpoint = None,
+    threads: Threads = None,
+    device: Device = None,
+    config: ConfigFile = None,
+    assignments: Assignments = None,
+) -> None:
+    """Find what moves by itself between two images of a moving camera.
+
+    [bold]Examples[/bold]
+
+      viflow-anomaly detect frame0.png frame1.png --imu imu.json --camera camera.json
+
+      viflow-anomaly detect frame0.png frame1.png --imu imu.csv --json --overlay out.png
+      --source-timestamp-ns 1403715273262142976 --target-timestamp-ns 1403715273312143104
+    """
+    options = {"checkpoint": checkpoint, "threads": threads, "device": device, "detector.include_masks": masks}
+    settings = settings_from(config, assignments, options)
+    from viflow_anomaly.cli.pair_files import PairFiles, load_pair
+    from viflow_anomaly.detection import to_json
+
+    files = PairFiles(source, target, imu, camera, source_timestamp_ns, target_timestamp_ns)
+    pair, decode_ms = load_pair(files, limits=settings.limits)
+    detector = load_detector(settings)
+    if overlay is None:
+        detection = detector.detect(pair, decode_ms=decode_ms)
+    else:
+        from viflow_anomaly.batch_pictures import overlay_of, write_png
+
+        analysis = detector.analyze(pair, decode_ms=decode_ms)
+        detection = analysis.detection
+        write_png(overlay, overlay_of(pair, analysis))
+    print(to_json(detection)) if as_json else _print_table(detection)
+
+
+def _print_table(detection: Detection) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console()
+    console.print(f"[bold]{detection.status}[/bold], {len(detection.rois)} regions, model {detection.model.name}")
+    for reason in detection.reasons:
+        console.print(f"  {reason.code}: {escape(reason.message)}", highlight=False)
+    if not detection.rois:
+        return
+    table = Table("id", "label", "score", "x", "y", "width", "height", "thickness px", "residual mean")
+    for roi in detection.rois:
+        box = roi.bbox
+        cells = (box.x, box.y, box.width, box.height, round(roi.thickness_px, 1), round(roi.residual_mean, 1))
+        table.add_row(str(roi.id), roi.label, f"{roi.score:.2f}", *map(str, cells))
+    console.print(table)
+
+
+def register(app: typer.Typer) -> None:
+    app.command(no_args_is_help=True)(detect)

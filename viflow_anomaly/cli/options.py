@@ -1,0 +1,67 @@
+"""Options that several commands share, and how they become ``Settings``."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from viflow_anomaly.detector import AnomalyDetector
+    from viflow_anomaly.settings import Settings
+
+ConfigFile = Annotated[
+    Path | None, typer.Option("--config", metavar="FILE", help="TOML or JSON file of settings (see `config`).")
+]
+Assignments = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="One setting, e.g. detector.regions.threshold_mads=8. Repeatable."),
+]
+Checkpoint = Annotated[
+    Path | None, typer.Option(metavar="PATH", help="Weights to use instead of the bundled model.", show_default=False)
+]
+Threads = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="CPU threads of one pair. 1 (default) answers soonest wherever other programs run.", metavar="N"
+    ),
+]
+Device = Annotated[str | None, typer.Option(metavar="DEVICE", help="cpu (default), cuda, cuda:1, ...")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on stdout, and nothing else there.")]
+
+
+def settings_from(
+    config: Path | None, assignments: Sequence[str] | None, options: Mapping[str, Any] | None = None
+) -> Settings:
+    """Command line > environment (``VIFLOW_*``) > file > defaults.
+
+    Raises:
+        ConfigError: see ``resolve_settings``.
+    """
+    from viflow_anomaly.settings import resolve_settings
+
+    return resolve_settings(config_file=config, environment=os.environ, assignments=assignments or (), options=options)
+
+
+def limit_threads(threads: int) -> None:
+    """Give torch and OpenCV this many CPU threads."""
+    import cv2
+    import torch
+
+    torch.set_num_threads(threads)
+    cv2.setNumThreads(threads)
+
+
+def load_detector(settings: Settings) -> AnomalyDetector:
+    """The detector that the settings describe, with its threads limited.
+
+    Raises:
+        CheckpointError: a checkpoint that cannot be used.
+    """
+    limit_threads(settings.threads)
+    from viflow_anomaly.detector import AnomalyDetector
+
+    return AnomalyDetector.from_checkpoint(settings.checkpoint, config=settings.detector, device=settings.device)

@@ -1,0 +1,47 @@
+"""``viflow-anomaly serve``: the HTTP service."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Annotated
+
+import typer
+
+from viflow_anomaly.cli.options import Assignments, Checkpoint, ConfigFile, Device, Threads, settings_from
+
+
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address to listen on (default 127.0.0.1).")] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port (default 8000; 0 takes a free one).")] = None,
+    checkpoint: Checkpoint = None,
+    threads: Threads = None,
+    device: Device = None,
+    config: ConfigFile = None,
+    assignments: Assignments = None,
+) -> None:
+    """Serve POST /detect, /healthz, /readyz and /version over HTTP until SIGINT or SIGTERM.
+
+    Limits and queue lengths are environment variables (VIFLOW_MAX_IMAGE_BYTES, ...); the README lists them.
+
+    [bold]Example[/bold]
+
+      viflow-anomaly serve --host 0.0.0.0 --port 8000
+    """
+    settings = settings_from(config, assignments, {"checkpoint": checkpoint, "threads": threads, "device": device})
+    # By name: the service is built on the library, so no module of the library may import it.
+    service_settings = import_module("viflow_anomaly_service.settings")
+    server = import_module("viflow_anomaly_service.server")
+    server.run(
+        service_settings.load_settings(
+            host=host,
+            port=port,
+            checkpoint=settings.checkpoint,
+            threads=settings.threads,
+            device=settings.device,
+            detector=settings.detector,
+        )
+    )
+
+
+def register(app: typer.Typer) -> None:
+    app.command()(serve)

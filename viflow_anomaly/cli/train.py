@@ -1,0 +1,68 @@
+"""``viflow-anomaly train``: unsupervised training on recordings."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from viflow_anomaly.cli.options import Assignments, ConfigFile, Device, settings_from
+
+
+def train(
+    data: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Recordings to train on, any known layout.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where checkpoints, logs and the final weights go.")],
+    validation: Annotated[
+        list[Path] | None, typer.Option(metavar="DIR", help="A recording to measure on, never to train on. Repeatable.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Training steps.")] = None,
+    batch_size: Annotated[int | None, typer.Option(min=1, help="Frame pairs in a step.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Fixes everything on a CPU.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint in --out.")] = False,
+    threads: Annotated[
+        int | None,
+        typer.Option(min=1, metavar="N", help="CPU threads; another number gives other weights (default 1)."),
+    ] = None,
+    device: Device = None,
+    config: ConfigFile = None,
+    assignments: Assignments = None,
+) -> None:
+    """Train a model on recordings without labels: the reconstruction of the source image is the teacher.
+
+    Settings are in the sections `model` and `training` (see `viflow-anomaly config`).
+
+    [bold]Examples[/bold]
+
+      viflow-anomaly train runs/sim/drone-* --validation runs/held-out/drone-000 --out runs/first --steps 20000
+
+      viflow-anomaly train runs/sim/drone-* --out runs/first --resume
+
+      viflow-anomaly train V1_01_easy/mav0 --out runs/paper --set model.preset=paper --set model.view.mode=center_crop
+    """
+    options = {
+        "training.steps": steps,
+        "training.batch_size": batch_size,
+        "training.seed": seed,
+        "training.threads": threads,
+        "device": device,
+    }
+    settings = settings_from(config, assignments, options)
+    from viflow_anomaly.training import train as train_model
+
+    checkpoint = train_model(
+        data,
+        out,
+        model=settings.model,
+        training=settings.training,
+        validation=validation or [],
+        device=settings.device,
+        resume=resume,
+        progress=sys.stderr.isatty(),
+    )
+    print(checkpoint)
+
+
+def register(app: typer.Typer) -> None:
+    app.command(no_args_is_help=True)(train)

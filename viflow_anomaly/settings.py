@@ -1,0 +1,175 @@
+"""Layered settings: command line over environment over configuration file over the defaults in the code.
+
+Environment variables start with ``VIFLOW_`` and go down a level at each double underscore
+(``VIFLOW_DETECTOR__REGIONS__THRESHOLD_MADS=8``). The file is TOML or JSON with the same names
+(``[detector.regions]``). Every layer is checked where it enters, so that an error names the layer at fault, and a
+wrong value is refused even where a higher layer would hide it.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field, PositiveInt
+
+from viflow_anomaly.config import DetectorConfig, FrozenConfig, ImageLimits, ModelConfig, TrainingConfig
+from viflow_anomaly.errors import ConfigError
+from viflow_anomaly.simulator.config import SimulatorConfig
+
+ENVIRONMENT_PREFIX = "VIFLOW_"
+
+Values = dict[str, Any]
+
+
+class Settings(FrozenConfig):
+    """All that the command line can be told; each command uses its own sections.
+
+    ``threads`` defaults to 1: one pair at a time is fastest that way wherever anything else runs on the machine,
+    because idle OpenMP threads of a wider pool spin and take the cores from each other.
+    """
+
+    checkpoint: Path | None = None
+    device: str = "cpu"
+    threads: PositiveInt = 1
+    limits: ImageLimits = ImageLimits()
+    detector: DetectorConfig = DetectorConfig()
+    model: ModelConfig = ModelConfig()
+    training: TrainingConfig = TrainingConfig()
+    simulator: SimulatorConfig = Field(default_factory=lambda: SimulatorConfig.model_validate({}))
+
+
+def resolve_settings(
+    *,
+    config_file: Path | None = None,
+    environment: Mapping[str, str],
+    assignments: Iterable[str] = (),
+    options: Mapping[str, Any] | None = None,
+) -> Settings:
+    """Merge the layers, lowest first, validating after each.
+
+    Args:
+        config_file: TOML or JSON, by its suffix.
+        environment: usually ``os.environ``.
+        assignments: ``section.key=value`` from the command line (``--set``).
+        options: dotted key -> value from dedicated command line options; None means "not given".
+
+    Raises:
+        ConfigError: ``config_invalid``, ``config_unreadable``, ``config_format_unknown``, ``assignment_invalid``.
+    """
+    given = {key: value for key, value in (options or {}).items() if value is not None}
+    layers: list[tuple[str, Values]] = []
+    if config_file is not None:
+        layers.append((str(config_file), read_config_file(config_file)))
+    layers.append(("environment", environment_values(environment)))
+    layers.append(("--set", assignment_values(assignments)))
+    layers.append(("command line", nested((key.split("."), value) for key, value in given.items())))
+    merged: Values = {}
+    settings = Settings()
+    for where, values in layers:
+        if values:
+            merged = _merge(merged, values)
+            settings = Settings.from_mapping(merged, where=where)
+    return settings
+
+
+def read_config_file(path: Path) -> Values:
+    """The mapping a TOML or JSON file holds.
+
+    Raises:
+        ConfigError: ``config_unreadable`` (missing, a directory, not TOML/JSON, not a table),
+            ``config_format_unknown``.
+    """
+    parse = {".toml": tomllib.loads, ".json": json.loads}.get(path.suffix.lower())
+    if parse is None:
+        raise ConfigError(
+            f"{path}: expected a configuration file ending in .toml or .json, found {path.suffix or 'no suffix'}",
+            code="config_format_unknown",
+        )
+    try:
+        values = parse(path.read_text(encoding="utf-8"))
+    except OSError as err:
+        raise ConfigError(
+            f"{path}: expected a readable configuration file, found: {err.strerror}", code="config_unreadable"
+        ) from err
+    except ValueError as err:  # tomllib's, json's and the decoder's errors are all ValueErrors
+        raise ConfigError(
+            f"{path}: expected a {path.suffix[1:].upper()} document, found: {err}", code="config_unreadable"
+        ) from err
+    if not isinstance(values, dict):
+        raise ConfigError(
+            f"{path}: expected a table of settings, found {type(values).__name__}", code="config_unreadable"
+        )
+    return values
+
+
+def environment_values(environment: Mapping[str, str]) -> Values:
+    """The settings among the environment variables; other ``VIFLOW_`` variables without ``__`` are left alone.
+
+    Raises:
+        ConfigError: ``config_invalid`` where a variable names a section that does not exist.
+    """
+    entries = []
+    for name, text in sorted(environment.items()):
+        if not name.startswith(ENVIRONMENT_PREFIX):
+            continue
+        path = name.removeprefix(ENVIRONMENT_PREFIX).lower().split("__")
+        known = path[0] in Settings.model_fields
+        if not known and len(path) > 1:
+            raise ConfigError(
+                f"environment: {name}: expected a section among {', '.join(sorted(Settings.model_fields))}, "
+                f"found {path[0]!r}",
+                code="config_invalid",
+                field=path[0],
+            )
+        if known:
+            entries.append((path, _value(text)))
+    return nested(entries)
+
+
+def assignment_values(assignments: Iterable[str]) -> Values:
+    """``["detector.regions.max_regions=8"]`` as a nested mapping; values are JSON where they parse as JSON.
+
+    Raises:
+        ConfigError: ``assignment_invalid``.
+    """
+    entries = []
+    for assignment in assignments:
+        key, equals, text = assignment.partition("=")
+        path = key.strip().split(".")
+        if not equals or not all(path):
+            raise ConfigError(
+                f"--set: expected section.key=value, found {assignment!r}", code="assignment_invalid", field=key or None
+            )
+        entries.append((path, _value(text.strip())))
+    return nested(entries)
+
+
+def nested(entries: Iterable[tuple[list[str], Any]]) -> Values:
+    """Paths and values as nested mappings; a later entry wins."""
+    values: Values = {}
+    for path, value in entries:
+        leaf: Any = value
+        for step in reversed(path):
+            leaf = {step: leaf}
+        values = _merge(values, leaf)
+    return values
+
+
+def _merge(lower: Values, upper: Values) -> Values:
+    merged = dict(lower)
+    for key, value in upper.items():
+        below = merged.get(key)
+        merged[key] = _merge(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+    return merged
+
+
+def _value(text: str) -> Any:
+    """JSON where it is JSON (numbers, booleans, lists), else the text itself."""
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
