@@ -25,12 +25,14 @@ Picture = NDArray[np.uint8]
 
 VERMILLION: Color = (0, 94, 213)
 SKY_BLUE: Color = (233, 180, 86)
+DARK_BLUE: Color = (110, 60, 0)
 YELLOW: Color = (66, 228, 240)
 WHITE: Color = (255, 255, 255)
 LIGHT_GRAY: Color = (190, 190, 190)
 BACKGROUND: Color = (24, 24, 24)
 
 MIN_PANEL_WIDTH_PX = 640
+MIN_WIDE_PANEL_WIDTH_PX = 960
 MAX_PANEL_WIDTH_PX = 1600
 WIDE_ASPECT_RATIO = 2.0
 HEAT_MAX_GRAY = 80.0
@@ -68,16 +70,24 @@ def draw_overlay(source: Uint8Array, detection: Detection, *, residual: Float32A
         BGR picture with even sides (video codecs want them).
     """
     height, width = source.shape
-    panel_width = min(max(width, MIN_PANEL_WIDTH_PX), MAX_PANEL_WIDTH_PX)
-    panel_height = max(1, round(height * panel_width / width))
-    size, scale = (panel_width, panel_height), _Scale(panel_width / width, panel_height / height)
+    stacked = width > WIDE_ASPECT_RATIO * height
+    size = _panel_size(width, height, MIN_WIDE_PANEL_WIDTH_PX if stacked else MIN_PANEL_WIDTH_PX)
+    scale = _Scale(size[0] / width, size[1] / height)
     panels = [
-        np.vstack([_source_title(panel_width, detection), _source_panel(source, detection, size, scale)]),
-        np.vstack([_heat_title(panel_width), _heat_panel(residual, detection, size, scale)]),
+        np.vstack([_source_title(size[0], detection), _source_panel(source, detection, size, scale)]),
+        np.vstack([_heat_title(size[0]), _heat_panel(residual, detection, size, scale)]),
     ]
-    body = np.vstack(panels) if width > WIDE_ASPECT_RATIO * height else np.hstack(_with_gap(panels))
+    body = np.vstack(panels) if stacked else np.hstack(_with_gap(panels))
     picture = np.vstack([body, _caption(body.shape[1], detection)])
     return _with_even_sides(picture)
+
+
+def _panel_size(width: int, height: int, min_width: int) -> tuple[int, int]:
+    """Small images grow by a whole factor (every pixel stays a square), huge ones shrink to the maximum."""
+    if width > MAX_PANEL_WIDTH_PX:
+        return MAX_PANEL_WIDTH_PX, max(1, round(height * MAX_PANEL_WIDTH_PX / width))
+    factor = -(-min_width // width)
+    return factor * width, factor * height
 
 
 def _with_gap(panels: list[Picture]) -> list[Picture]:
@@ -92,9 +102,9 @@ def _source_panel(source: Uint8Array, detection: Detection, size: tuple[int, int
     analyzed = np.zeros(panel.shape[:2], dtype=np.bool_)
     analyzed[top : bottom + 1, left : right + 1] = True
     panel[~analyzed] //= 3
-    faint_first = sorted(detection.rois, key=lambda roi: (roi.label == "independent_motion", roi.score))
-    for roi in faint_first:
-        _draw_roi(panel, roi, scale)
+    for draw in (_draw_box, _draw_label):
+        for roi in sorted(detection.rois, key=lambda roi: (roi.label == "independent_motion", roi.score)):
+            draw(panel, roi, scale)
     if detection.status == "abstained":
         _draw_tag(panel, "ABSTAINED: not judged", (MARGIN_PX, MARGIN_PX + LINE_HEIGHT_PX), fill=YELLOW, ink=(0, 0, 0))
     return panel
@@ -119,17 +129,26 @@ def _resized(image: Uint8Array, size: tuple[int, int]) -> Uint8Array:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_NEAREST), np.uint8)
 
 
-def _draw_roi(panel: Picture, roi: Roi, scale: _Scale) -> None:
+def _draw_box(panel: Picture, roi: Roi, scale: _Scale) -> None:
     left_top, right_bottom = scale.corners(*roi.bbox)
     if roi.label == "model_error":
         _draw_dashed_box(panel, left_top, right_bottom)
+    else:
+        cv2.rectangle(panel, left_top, right_bottom, VERMILLION, 2)
+
+
+def _draw_label(panel: Picture, roi: Roi, scale: _Scale) -> None:
+    """Above the box, or below it at the image's upper edge."""
+    if roi.label == "model_error":
         return
-    cv2.rectangle(panel, left_top, right_bottom, VERMILLION, 2)
+    (left, top), (_, bottom) = scale.corners(*roi.bbox)
+    y = top - 2 if top > LINE_HEIGHT_PX else bottom + LINE_HEIGHT_PX
     track = "" if roi.track_id is None else f"#{roi.track_id} "
-    _draw_tag(panel, f"{track}motion {roi.score:.2f}", (left_top[0] - 1, left_top[1] - 2), fill=VERMILLION, ink=WHITE)
+    _draw_tag(panel, f"{track}motion {roi.score:.2f}", (left - 1, y), fill=VERMILLION, ink=WHITE)
 
 
 def _draw_dashed_box(panel: Picture, left_top: tuple[int, int], right_bottom: tuple[int, int]) -> None:
+    cv2.rectangle(panel, left_top, right_bottom, DARK_BLUE, 1)  # between the dashes, for bright surroundings
     (left, top), (right, bottom) = left_top, right_bottom
     for x in range(left, right + 1, 2 * DASH_PX):
         for y in (top, bottom):
