@@ -148,10 +148,10 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
     text = re.sub(r"^%YAML.*$", "", read_text(path), flags=re.MULTILINE)
     try:
         content = yaml.safe_load(text)
-    except yaml.YAMLError as err:
+    except (yaml.YAMLError, ValueError, RecursionError) as err:  # ValueError: an impossible date
         mark = getattr(err, "problem_mark", None)
         line = "" if mark is None else f", line {mark.line + 1}"
-        problem = getattr(err, "problem", None) or "unreadable text"
+        problem = getattr(err, "problem", None) or str(err)[:120]
         raise DatasetError(f"{path}{line}: expected YAML, found: {problem}", code="yaml_malformed") from err
     if not isinstance(content, Mapping):
         raise DatasetError(f"{path}: expected YAML keys, found {type(content).__name__}", code="yaml_malformed")

@@ -87,8 +87,8 @@ def read_camera(path: Path) -> PinholeCamera | None:
         return None
     try:
         mapping = json.loads(read_text(path))
-    except json.JSONDecodeError as err:
-        raise DatasetError(f"{path}, line {err.lineno}: {err.msg}", code="json_malformed") from err
+    except (ValueError, RecursionError) as err:
+        raise DatasetError(f"{path}: expected JSON, found: {str(err)[:120]}", code="json_malformed") from err
     try:
         return camera_from_mapping(mapping)
     except InvalidInputError as err:
