@@ -50,7 +50,7 @@ def simulate(
     from viflow_anomaly.simulator import simulate as simulate_sequences
 
     with stderr_progress() as progress:
-        task = progress.add_task("frames", total=simulator.sequences * simulator.frames)
+        task = progress.add_task("sequences", total=simulator.sequences)
         folders = simulate_sequences(
             simulator, out, on_progress=lambda done, total: progress.update(task, completed=done, total=total)
         )
