@@ -1,0 +1,77 @@
+"""Pixel centres lie at integer coordinates: an integer shift is exact, half a pixel is the mean of two."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from worlds import textured_image
+
+from viflow_anomaly.errors import TooLargeError
+from viflow_anomaly.geometry import pixel_grid
+from viflow_anomaly.residual import photometric_residual, reconstruct
+
+H, W = 40, 56
+IMAGE = textured_image(W, H)
+
+
+def test_identity_reconstructs_every_pixel_exactly() -> None:
+    reconstruction, inside = reconstruct(IMAGE, pixel_grid(H, W))
+    assert reconstruction.dtype == np.float32
+    np.testing.assert_array_equal(reconstruction, IMAGE)
+    assert inside.all()
+    assert not photometric_residual(IMAGE, reconstruction, inside).any()
+
+
+@pytest.mark.parametrize(("du", "dv"), [(3, 0), (0, -2), (-4, 5)])
+def test_an_integer_shift_is_exact(du: int, dv: int) -> None:
+    target = np.roll(IMAGE, (dv, du), axis=(0, 1))
+    reconstruction, inside = reconstruct(target, pixel_grid(H, W) + np.float32([du, dv]))
+    u, v = np.meshgrid(np.arange(W) + du, np.arange(H) + dv)
+    np.testing.assert_array_equal(inside, (u >= 0) & (u < W) & (v >= 0) & (v < H))
+    np.testing.assert_array_equal(reconstruction[inside], IMAGE[inside])
+    assert not photometric_residual(IMAGE, reconstruction, inside).any()
+
+
+def test_half_a_pixel_is_the_mean_of_two() -> None:
+    reconstruction, inside = reconstruct(IMAGE, pixel_grid(H, W) + np.float32([0.5, 0.0]))
+    expected = 0.5 * (IMAGE[:, :-1].astype(np.float64) + IMAGE[:, 1:])
+    np.testing.assert_allclose(reconstruction[:, :-1], expected, atol=1e-3)
+    assert not inside[:, -1].any()
+
+
+def test_the_source_may_have_another_size_than_the_target() -> None:
+    reconstruction, inside = reconstruct(IMAGE, pixel_grid(H // 2, W // 2) * 2)
+    np.testing.assert_array_equal(reconstruction, IMAGE[::2, ::2])
+    assert inside.all()
+
+
+@pytest.mark.parametrize("coordinate", [np.nan, np.inf, -np.inf, 1e30, -1e30, -0.01, W - 0.99])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_coordinate_beyond_the_image_is_outside(coordinate: float, axis: int) -> None:
+    coordinates = pixel_grid(H, W)
+    coordinates[7, 9, axis] = coordinate
+    reconstruction, inside = reconstruct(IMAGE, coordinates)
+    residual = photometric_residual(IMAGE, reconstruction, inside)
+    assert not inside[7, 9]
+    assert np.count_nonzero(~inside) == 1
+    assert np.isfinite(reconstruction).all()
+    assert residual[7, 9] == 0
+
+
+def test_residual_is_the_absolute_difference_inside() -> None:
+    inside = np.ones((H, W), dtype=np.bool_)
+    inside[:, :5] = False
+    residual = photometric_residual(IMAGE, np.full((H, W), 100.0, dtype=np.float32), inside)
+    np.testing.assert_array_equal(residual[:, 5:], np.abs(IMAGE[:, 5:].astype(np.float32) - 100.0))
+    assert not residual[:, :5].any()
+    assert residual.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("target_shape", "source_shape"),
+    [((32768, 1), (2, 2)), ((1, 32768), (2, 2)), ((2, 2), (32768, 1)), ((2, 2), (1, 32768))],
+)
+def test_sides_beyond_what_opencv_can_address(target_shape: tuple[int, int], source_shape: tuple[int, int]) -> None:
+    with pytest.raises(TooLargeError, match="32767") as caught:
+        reconstruct(np.zeros(target_shape, np.uint8), np.zeros((*source_shape, 2), np.float32))
+    assert caught.value.code == "image_too_large"
