@@ -16,11 +16,14 @@ class AdmissionGate:
         max_concurrent: requests that compute at once.
         max_queued: further requests that may upload or wait for their turn.
         queue_timeout_s: longest wait for a turn.
+
+    Attributes:
+        present: requests inside, computing or not.
     """
 
     def __init__(self, *, max_concurrent: int, max_queued: int, queue_timeout_s: float) -> None:
         self._capacity = max_concurrent + max_queued
-        self._present = 0
+        self.present = 0
         self._turns = asyncio.Semaphore(max_concurrent)
         self._queue_timeout_s = queue_timeout_s
 
@@ -31,13 +34,13 @@ class AdmissionGate:
         Raises:
             Problem: 503 ``overloaded``.
         """
-        if self._present >= self._capacity:
+        if self.present >= self._capacity:
             raise _overloaded(f"all {self._capacity} places are taken")
-        self._present += 1
+        self.present += 1
         try:
             yield
         finally:
-            self._present -= 1
+            self.present -= 1
 
     @asynccontextmanager
     async def turn(self) -> AsyncIterator[None]:

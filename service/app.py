@@ -7,6 +7,7 @@ import importlib.metadata
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
+from http import HTTPStatus
 from typing import Any, Final
 
 from fastapi import FastAPI, Request, Response
@@ -135,6 +136,8 @@ def _add_detect(app: FastAPI, slot: DetectorSlot, settings: ServiceSettings, wor
         queue_timeout_s=settings.queue_timeout_s,
     )
 
+    app.state.gate = gate
+
     @app.post("/detect", operation_id="detect", tags=["detection"], **detect_operation())
     async def detect(request: Request) -> Response:
         """Regions of independent motion in the source image of one pair, highest score first."""
@@ -150,8 +153,10 @@ def _add_detect(app: FastAPI, slot: DetectorSlot, settings: ServiceSettings, wor
                     answer = await asyncio.get_running_loop().run_in_executor(
                         workers, answer_request, detector, data, content_type, settings
                     )
-        except Problem:
-            await body.discard()
+        except Problem as problem:
+            if problem.status != HTTPStatus.REQUEST_TIMEOUT:
+                await body.discard()
+            problem.closes_connection = not body.finished
             raise
         return Response(answer, media_type=JSON_MEDIA_TYPE)
 

@@ -49,6 +49,7 @@ class Problem(Exception):  # noqa: N818 - the RFC's own word
         field: the input at fault in dotted form, or None.
         faults: further fields at fault, each ``{"code", "field", "detail"}``.
         retry_after_s: seconds after which trying again makes sense.
+        closes_connection: the request was not read to its end, so that the connection cannot serve another one.
     """
 
     def __init__(
@@ -68,6 +69,7 @@ class Problem(Exception):  # noqa: N818 - the RFC's own word
         self.field = field
         self.faults = faults or []
         self.retry_after_s = retry_after_s
+        self.closes_connection = False
 
     def body(self, request_id: str) -> dict[str, Any]:
         """The members of the answer's JSON object."""
@@ -91,6 +93,8 @@ class Problem(Exception):  # noqa: N818 - the RFC's own word
         extra = dict(headers or {})
         if self.retry_after_s is not None:
             extra["Retry-After"] = str(self.retry_after_s)
+        if self.closes_connection:
+            extra["Connection"] = "close"
         return Response(content, status_code=self.status, media_type=PROBLEM_MEDIA_TYPE, headers=extra)
 
 
@@ -103,12 +107,15 @@ def problem_of_error(err: ViflowError, field_names: Mapping[str, str] | None = N
     """The answer to an error that the library raised.
 
     Args:
-        err: the error; classes that bad input cannot cause become a 500.
+        err: the error.
         field_names: the library's field names as this kind of request calls them.
+
+    Raises:
+        ViflowError: ``err`` itself, of a class that a client's input cannot cause.
     """
     status = next((status for kind, status in _STATUS_OF_ERROR if isinstance(err, kind)), None)
     if status is None:
-        return unexpected_problem()
+        raise err
     return Problem(status, code=err.code, detail=err.message, field=_renamed(err.field, field_names or {}))
 
 
@@ -141,28 +148,18 @@ def problem_of_validation(err: ValidationError, prefix: str | None = None) -> Pr
 
 
 def install_problem_handlers(app: FastAPI) -> None:
-    """Make the app answer problems for our errors and for the router's own 404 and 405."""
+    """Make the app answer problems for ours and for the router's own 404 and 405."""
 
-    async def on_problem(request: Request, err: Exception) -> Response:
-        problem = err if isinstance(err, Problem) else unexpected_problem()
+    @app.exception_handler(Problem)
+    async def on_problem(request: Request, problem: Problem) -> Response:
         return _answer(request, problem)
 
-    async def on_library_error(request: Request, err: Exception) -> Response:
-        problem = problem_of_error(err) if isinstance(err, ViflowError) else unexpected_problem()
-        return _answer(request, problem)
-
-    async def on_http_exception(request: Request, err: Exception) -> Response:
-        status = err.status_code if isinstance(err, HTTPException) else 500
-        headers = err.headers if isinstance(err, HTTPException) else None
-        phrase = HTTPStatus(status).phrase
-        problem = Problem(
-            status, code=phrase.lower().replace(" ", "_"), detail=f"{request.method} {request.url.path}: {phrase}"
-        )
-        return _answer(request, problem, headers)
-
-    app.add_exception_handler(Problem, on_problem)
-    app.add_exception_handler(ViflowError, on_library_error)
-    app.add_exception_handler(HTTPException, on_http_exception)
+    @app.exception_handler(HTTPException)
+    async def on_http_exception(request: Request, err: HTTPException) -> Response:
+        phrase = HTTPStatus(err.status_code).phrase
+        code = phrase.lower().replace(" ", "_")
+        problem = Problem(err.status_code, code=code, detail=f"{request.method} {request.url.path}: {phrase}")
+        return _answer(request, problem, err.headers)
 
 
 def _answer(request: Request, problem: Problem, headers: Mapping[str, str] | None = None) -> Response:

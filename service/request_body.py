@@ -14,11 +14,16 @@ DISCARD_SECONDS: Final = 2.0
 
 
 class RequestBody:
-    """Reads or discards what a client sends; holds at most the limit in memory."""
+    """Reads or discards what a client sends; holds at most the limit in memory.
+
+    Attributes:
+        finished: all of it has arrived, or the client has gone.
+    """
 
     def __init__(self, request: Request) -> None:
         self._request = request
-        self._finished = False
+        self._started = False
+        self.finished = False
 
     async def read(self, *, max_bytes: int, timeout_s: float) -> bytes:
         """The whole body.
@@ -38,7 +43,7 @@ class RequestBody:
         size = 0
         try:
             async with asyncio.timeout(timeout_s):
-                while not self._finished:
+                while not self.finished:
                     chunk = await self._next_chunk()
                     size += len(chunk)
                     if size > max_bytes:
@@ -50,18 +55,24 @@ class RequestBody:
         return b"".join(chunks)
 
     async def discard(self) -> None:
-        """Swallow the rest for a moment: a client that is still sending would else see a reset, not the answer."""
+        """Swallow the rest for a moment: a client that is still sending would else see a reset, not the answer.
+
+        A client that asked first (``Expect: 100-continue``) and was not told to go on is not sending.
+        """
+        if not self._started and "expect" in self._request.headers:
+            return
         with contextlib.suppress(TimeoutError, ClientDisconnect):
             async with asyncio.timeout(DISCARD_SECONDS):
-                while not self._finished:
+                while not self.finished:
                     await self._next_chunk()
 
     async def _next_chunk(self) -> bytes:
+        self._started = True
         message = await self._request.receive()
         if message["type"] == "http.disconnect":
-            self._finished = True
+            self.finished = True
             raise ClientDisconnect
-        self._finished = not message.get("more_body", False)
+        self.finished = not message.get("more_body", False)
         chunk: bytes = message.get("body", b"")
         return chunk
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic_settings import BaseSettings, SettingsConfigDict, SettingsError
 
 from viflow_anomaly.config import DetectorConfig, ImageLimits, describe_validation
 from viflow_anomaly.errors import ConfigError
@@ -70,3 +70,5 @@ def load_settings(**overrides: Any) -> ServiceSettings:
         raise ConfigError(
             f"service settings: {describe_validation(err)}", code="config_invalid", field=place or None
         ) from err
+    except SettingsError as err:  # a section that is not JSON
+        raise ConfigError(f"service settings: {err}", code="config_invalid") from err

@@ -1,0 +1,59 @@
+from __future__ import annotations
+
+import pytest
+
+from viflow_anomaly.errors import ConfigError
+from viflow_anomaly_service.settings import load_settings
+
+
+def test_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("VIFLOW_HOST", "VIFLOW_PORT", "VIFLOW_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    settings = load_settings()
+    assert (settings.host, settings.port, settings.threads, settings.checkpoint) == ("127.0.0.1", 8000, 1, None)
+    assert settings.max_concurrent >= 1
+    assert (settings.image_limits.max_bytes, settings.image_limits.max_pixels) == (2**24, 2**24)
+
+
+def test_argument_over_environment_over_default(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VIFLOW_PORT", "9001")
+    monkeypatch.setenv("VIFLOW_MAX_IMAGE_PIXELS", "4096")
+    monkeypatch.setenv("VIFLOW_DETECTOR__REGIONS__THRESHOLD_MADS", "8.5")
+    settings = load_settings(host="0.0.0.0", port=None)  # noqa: S104 - nothing listens
+    assert (settings.host, settings.port) == ("0.0.0.0", 9001)  # noqa: S104
+    assert settings.image_limits.max_pixels == 4096
+    assert settings.detector.regions.threshold_mads == 8.5
+    assert settings.detector.regions.max_regions == 64
+    assert load_settings(port=9002).port == 9002
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "place"),
+    [
+        ("VIFLOW_PORT", "http", "port"),
+        ("VIFLOW_PORT", "65536", "port"),
+        ("VIFLOW_THREADS", "0", "threads"),
+        ("VIFLOW_MAX_BODY_BYTES", "-1", "max_body_bytes"),
+        ("VIFLOW_QUEUE_TIMEOUT_S", "inf", "queue_timeout_s"),
+        ("VIFLOW_LOG_LEVEL", "loud", "log_level"),
+        ("VIFLOW_DETECTOR__REGIONS__THRESHOLD", "1", "detector.regions.threshold"),
+    ],
+)
+def test_a_wrong_variable_is_named(monkeypatch: pytest.MonkeyPatch, name: str, value: str, place: str) -> None:
+    monkeypatch.setenv(name, value)
+    with pytest.raises(ConfigError) as caught:
+        load_settings()
+    assert (caught.value.code, caught.value.field) == ("config_invalid", place)
+
+
+def test_an_unknown_setting_is_refused() -> None:
+    with pytest.raises(ConfigError, match="colour"):
+        load_settings(colour="red")
+
+
+def test_an_unreadable_section_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VIFLOW_DETECTOR", "{")
+    with pytest.raises(ConfigError) as caught:
+        load_settings()
+    assert caught.value.code == "config_invalid"
+    assert "detector" in str(caught.value)
