@@ -12,6 +12,7 @@ from viflow_anomaly.simulator.shapes import car, compound, cyclist, pedestrian, 
 
 WAYPOINT_S = 1.5
 SPEED_M_S = (0.3, 3.0)
+DISTANCES_M = (1.2, 8.0)
 AIR_CLEARANCE_M = 0.6
 ROAD_CLEARANCE_M = 4.5
 
@@ -48,21 +49,22 @@ def _waypoints(
 ) -> Float64Array:
     """One point in view at each of the given frames, each within reach of the one before."""
     points: list[Float64Array] = []
+    fastest = float(np.exp(rng.uniform(np.log(2 * SPEED_M_S[0]), np.log(SPEED_M_S[1]))))
     for frame in frames:
         pose = poses[int(frame)]
-        candidates = np.stack([_point_in_view(rng, camera, pose, (1.2, 6.0)) for _ in range(24)])
+        candidates = np.stack([_point_in_view(rng, camera, pose, DISTANCES_M) for _ in range(24)])
         candidates[:, 2] = np.maximum(candidates[:, 2], low_m)
         if not points:
             points.append(candidates[0])
             continue
         travel = candidates - points[-1]
         speeds = np.linalg.norm(travel, axis=1) / step_s
-        reachable = np.flatnonzero((speeds >= SPEED_M_S[0]) & (speeds <= SPEED_M_S[1]))
+        reachable = np.flatnonzero((speeds >= SPEED_M_S[0]) & (speeds <= fastest))
         if reachable.size:
             points.append(candidates[reachable[0]])
         else:
             best = int(np.argmin(speeds))
-            points.append(points[-1] + travel[best] * min(1.0, SPEED_M_S[1] / max(speeds[best], 1e-9)))
+            points.append(points[-1] + travel[best] * min(1.0, fastest / max(speeds[best], 1e-9)))
     return np.stack(points)
 
 

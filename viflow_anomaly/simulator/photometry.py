@@ -46,13 +46,13 @@ class Photometry:
 def draw_photometry(
     rng: np.random.Generator, camera: PinholeCamera, probes: list[Uint8Array], times_s: NDArray[np.float64]
 ) -> Photometry:
-    """Draw a camera response; the exposure brings the probe images' mean to 80-140; an eighth may burn out (the sky)."""
+    """Draw a camera response; the exposure brings the probe images' mean to 80-140 unless too much of them (5 to 45 %) would burn out."""
     offsets = pixel_grid(camera.height, camera.width) - np.array([camera.cx, camera.cy], np.float32)
     radius2 = (offsets**2).sum(axis=-1)
     vignette = 1.0 - rng.uniform(0.0, 0.35) * radius2 / radius2.max()
     gamma = float(rng.uniform(0.8, 1.2))
     pixels = np.stack(probes).astype(np.float64) / 255.0
-    wanted_mean, brightest = rng.uniform(80, 140) / 255.0, float(np.percentile(pixels, 88))
+    wanted_mean, brightest = rng.uniform(80, 140) / 255.0, float(np.percentile(pixels, rng.uniform(55, 95)))
     mean = max(float(np.mean(pixels**gamma)), 1e-3)
     gain = min((wanted_mean / mean) ** (1 / gamma), 1.05 / max(brightest, 1e-3))
     drift = Harmonics.random(rng, frequencies_hz=(0.05, 0.5), count=4)

@@ -21,6 +21,8 @@ from viflow_anomaly.simulator.scene import Material, Scene, Solid
 
 NEAR_M = 0.05
 SKY_FACES = 6
+PLANE_CELLS = 10
+HIDDEN_GROUP = 5  # of MuJoCo's geom groups: not drawn by default
 # MuJoCo cameras look along -z with y up; ours along +z with y down.
 R_CAMERA_GL = np.diag([1.0, -1.0, -1.0])
 
@@ -110,7 +112,7 @@ def _add_solid(mujoco: Any, body: Any, solid: Solid) -> None:
     shapes = mujoco.mjtGeom
     size = list(solid.size_m)
     if solid.shape == "plane":
-        size[2] = 1.0
+        size[2] = max(size[:2]) / PLANE_CELLS  # the third size is the spacing of the drawn grid
     body.add_geom(
         type=getattr(shapes, f"mjGEOM_{solid.shape.upper()}"),
         size=size,
@@ -175,6 +177,7 @@ def build_model(mujoco: Any, scene: Scene, camera: PinholeCamera, supersampling:
     spec.visual.global_.offheight = camera.height * supersampling
     spec.visual.quality.offsamples = 0
     spec.visual.quality.shadowsize = 0
+    spec.visual.quality.numslices, spec.visual.quality.numstacks = 20, 12
     spec.visual.map.znear, spec.visual.map.zfar = NEAR_M, scene.far_m
     spec.stat.extent = 1.0
     for material in scene.materials:
@@ -252,8 +255,20 @@ class SceneRenderer:
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
         option, perturbation = mujoco.MjvOption(), mujoco.MjvPerturb()
+        self._model.geom_group[:] = np.where(self._in_view(T_world_cam), 0, HIDDEN_GROUP)
         every = int(mujoco.mjtCatBit.mjCAT_ALL)
         mujoco.mjv_updateScene(self._model, self._data, option, perturbation, self._view_camera, every, self._view)
+
+    def _in_view(self, T_world_cam: Float64Array) -> NDArray[np.bool_]:
+        """[ngeom]: not wholly outside the image by its bounding sphere. Mesa processes what nobody sees otherwise."""
+        radii = np.asarray(self._model.geom_rbound)
+        points = (np.asarray(self._data.geom_xpos) - T_world_cam[:3, 3]) @ T_world_cam[:3, :3]
+        camera = self._camera
+        corners = np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])
+        low, high = (corners - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        planes = np.array([[1, 0, -low[0]], [-1, 0, high[0]], [0, 1, -low[1]], [0, -1, high[1]], [0, 0, 1.0]])
+        inside = points @ (planes / np.linalg.norm(planes, axis=1, keepdims=True)).T
+        return np.asarray((inside >= -radii[:, None] - 0.01).all(axis=1) | (radii == 0))  # planes are unbounded: 0
 
     def gray(self) -> Uint8Array:
         """[H, W] uint8, rendered at the supersampled size and averaged."""

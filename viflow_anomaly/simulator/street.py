@@ -123,6 +123,12 @@ def _beside(
         place, rotation = at(walk + rng.uniform(-1.0, 3.0), rng.uniform(-4, 4), rng.uniform(0, np.pi))
         extent = rng.uniform(0.5, 2.0)
         things.append(moved(compound(rng, extent, names), place + (0, 0, extent * 0.35), rotation))
+    if rng.random() < 0.9 - 0.6 * layout.houses:  # a tree line, bushes
+        place, rotation = at(walk + rng.uniform(4.0, 35.0), rng.uniform(-5, 5))
+        things.append(moved(tree(rng, str(rng.choice(names)), names), place, rotation))
+        radii = tuple(float(r) for r in rng.uniform(0.4, 1.8, 3))
+        place, rotation = at(walk + rng.uniform(0.5, 14.0), rng.uniform(-5, 5))
+        things.append((Solid("ellipsoid", radii, place + (0, 0, 0.5 * radii[2]), rotation, str(rng.choice(names))),))
     if rng.random() < 0.25:
         size = (8.0, 0.12, rng.uniform(0.6, 2.2))
         place, rotation = at(walk + rng.uniform(0.0, 0.4))
