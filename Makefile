@@ -17,6 +17,16 @@ DEMO_SAMPLE ?= samples/drone
 DEMO_OUT ?= demo-output
 COVERAGE_FLOOR ?= 90
 
+# The recipe of the bundled model. Held-out seeds are never trained on.
+MODEL_DIR ?= runs/model
+MODEL_TRAIN_SEED ?= 1000
+MODEL_HELD_OUT_SEED ?= 900000
+MODEL_DRONE_SEQUENCES ?= 60
+MODEL_CAR_SEQUENCES ?= 40
+MODEL_FRAMES ?= 60
+MODEL_STEPS ?= 20000
+MODEL_JOBS ?= 1
+
 .PHONY: demo test lint model wheel clean distclean
 
 $(VENV)/.torch: constraints.txt
@@ -58,6 +68,15 @@ wheel: $(VENV)/.installed
 	rm -rf build dist
 	$(PIP) wheel --quiet --no-deps --wheel-dir dist .
 	$(BIN)/python .ci/check_wheel.py dist/*.whl
+
+model: $(VENV)/.installed-dev
+	for rig in drone:$(MODEL_DRONE_SEQUENCES) car:$(MODEL_CAR_SEQUENCES); do \
+	  common="--rig $${rig%:*} --frames $(MODEL_FRAMES) --jobs $(MODEL_JOBS)"; \
+	  $(BIN)/viflow-anomaly simulate $$common --sequences $${rig#*:} --seed $(MODEL_TRAIN_SEED) --out $(MODEL_DIR)/train; \
+	  $(BIN)/viflow-anomaly simulate $$common --sequences 4 --seed $(MODEL_HELD_OUT_SEED) --out $(MODEL_DIR)/held-out; \
+	done
+	validation=; for folder in $(MODEL_DIR)/held-out/*/; do validation+=" --validation $$folder"; done; \
+	$(BIN)/viflow-anomaly train $(MODEL_DIR)/train/*/ $$validation --out $(MODEL_DIR)/run --steps $(MODEL_STEPS) --resume
 
 clean:
 	rm -rf build dist $(DEMO_OUT) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis .coverage

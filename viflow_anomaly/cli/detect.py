@@ -71,9 +71,10 @@ def detect(
 
 
 def _print_table(detection: Detection) -> None:
+    from rich.box import SIMPLE
     from rich.console import Console
     from rich.markup import escape
-    from rich.table import Table
+    from rich.table import Column, Table
 
     console = Console()
     console.print(f"[bold]{detection.status}[/bold], {len(detection.rois)} regions, model {detection.model.name}")
@@ -81,11 +82,12 @@ def _print_table(detection: Detection) -> None:
         console.print(f"  {reason.code}: {escape(reason.message)}", highlight=False)
     if not detection.rois:
         return
-    table = Table("id", "label", "score", "x", "y", "width", "height", "thickness px", "residual mean")
+    table = Table("id", Column("label", no_wrap=True), "score", "x, y", "w x h", "thick px", "residual", box=SIMPLE)
     for roi in detection.rois:
         box = roi.bbox
-        cells = (box.x, box.y, box.width, box.height, round(roi.thickness_px, 1), round(roi.residual_mean, 1))
-        table.add_row(str(roi.id), roi.label, f"{roi.score:.2f}", *map(str, cells))
+        place, size = f"{box.x}, {box.y}", f"{box.width} x {box.height}"
+        measures = (f"{roi.thickness_px:.1f}", f"{roi.residual_mean:.1f}")
+        table.add_row(str(roi.id), roi.label, f"{roi.score:.2f}", place, size, *measures)
     console.print(table)
 
 

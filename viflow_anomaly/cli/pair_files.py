@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import ConfigDict, Field, ValidationError
@@ -20,6 +19,7 @@ from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples, PinholeCame
 # As much as `batch` takes around a pair (datasets.pairing): the same pair gives the same answer.
 _MARGIN_NS = 250_000_000
 _Vector = tuple[float, float, float]
+_Stamp = Annotated[int, Field(ge=-(2**63), le=2**63 - 1)]
 
 
 class ImuDocument(FrozenConfig):
@@ -27,11 +27,11 @@ class ImuDocument(FrozenConfig):
 
     model_config = ConfigDict(strict=True)
 
-    timestamps_ns: list[int]
+    timestamps_ns: list[_Stamp]
     gyro_rad_s: list[_Vector]
     accel_m_s2: list[_Vector] | None = None
-    source_timestamp_ns: int | None = Field(default=None, ge=0)
-    target_timestamp_ns: int | None = Field(default=None, ge=0)
+    source_timestamp_ns: _Stamp | None = None
+    target_timestamp_ns: _Stamp | None = None
 
 
 @dataclass(frozen=True)
@@ -96,28 +96,17 @@ def _read_camera(path: Path) -> PinholeCamera:
 
 
 def _read_document(path: Path) -> ImuDocument:
-    values = _read_json(path)
     try:
-        return ImuDocument.model_validate(values)
-    except ValidationError as err:
-        problems = err.errors()
-        place = ".".join(["imu", *map(str, problems[0]["loc"])])
-        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        raise InvalidInputError(
-            f"{path}: {place}: {problems[0]['msg']}, found {problems[0]['input']!r:.80}{more}",
-            code="imu_document_invalid",
-            field=place,
-        ) from err
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_bytes())
+        return ImuDocument.model_validate_json(path.read_bytes())
     except OSError as err:
         raise InvalidInputError(
             f"{path}: expected an imu.json or imu.csv, found: {err.strerror}", code="imu_unreadable", field="imu"
         ) from err
-    except (ValueError, RecursionError) as err:  # broken JSON, bytes that are no text, nesting without end
+    except ValidationError as err:
+        problems = err.errors()
+        place = ".".join(["imu", *map(str, problems[0]["loc"])])
+        found = "" if problems[0]["type"] in ("json_invalid", "missing") else f", found {problems[0]['input']!r:.80}"
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         raise InvalidInputError(
-            f"{path}: expected a JSON document, found: {err}", code="imu_unreadable", field="imu"
+            f"{path}: {place}: {problems[0]['msg']}{found}{more}", code="imu_document_invalid", field=place
         ) from err

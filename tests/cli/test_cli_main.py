@@ -1,0 +1,215 @@
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from pair_world import Ask, PairFolder
+
+from viflow_anomaly.cli import main as cli_main
+from viflow_anomaly.cli.progress import stderr_progress
+from viflow_anomaly.detection import load_detection_schema
+from viflow_anomaly.errors import CheckpointError
+
+COMMANDS = ("detect", "batch", "simulate", "train", "serve", "schema", "config")
+HEAVY = {"torch", "cv2", "skimage", "mujoco", "fastapi"}
+
+
+def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env={**os.environ, **environment}
+    )
+
+
+def test_help_loads_nothing_heavy() -> None:
+    asked = [["--help"], ["--version"], ["schema"], *([command, "--help"] for command in COMMANDS)]
+    code = f"""
+import sys
+from viflow_anomaly.cli.main import run
+codes = [run(arguments) for arguments in {asked!r}]
+print("loaded:", codes, sorted({HEAVY!r} & set(sys.modules)))
+"""
+    done = python(code)
+    assert done.stdout.splitlines()[-1] == f"loaded: {[0] * len(asked)} []"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_shows_an_example(ask: Ask, command: str) -> None:
+    answer = ask([command, "--help"])
+    assert answer.code == 0
+    assert "Example" in answer.out
+    assert answer.out.count(f"viflow-anomaly {command}") >= 2
+
+
+def test_help_names_every_command(ask: Ask) -> None:
+    answer = ask(["--help"])
+    assert all(f" {command} " in answer.out for command in COMMANDS)
+    assert "Exit codes: 0 done" in answer.out
+
+
+def test_version(ask: Ask) -> None:
+    answer = ask(["--version"])
+    assert (answer.code, answer.out) == (0, f"viflow-anomaly {version('viflow-anomaly')}\n")
+
+
+def test_the_installed_command_answers() -> None:
+    command = Path(sys.executable).with_name("viflow-anomaly")
+    done = subprocess.run([command, "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("viflow-anomaly ")
+
+
+def test_unknown_command(ask: Ask) -> None:
+    assert ask(["bach"]).is_refusal("No such command 'bach'")
+
+
+def test_schema_is_the_shipped_one(ask: Ask) -> None:
+    answer = ask(["schema"])
+    assert json.loads(answer.out) == load_detection_schema()
+
+
+def test_config_prints_what_resolves_here(ask: Ask, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VIFLOW_TRAINING__STEPS", "7")
+    settings = json.loads(ask(["config", "--set", "model.preset=paper"]).out)
+    assert settings["training"]["steps"] == 7
+    assert settings["model"]["preset"] == "paper"
+    assert settings["simulator"]["rig"] == "drone"
+
+
+def test_config_refuses_unknown_keys(ask: Ask) -> None:
+    assert ask(["config", "--set", "model.layers=3"]).is_refusal("--set: model.layers: Extra inputs are not permitted")
+
+
+# --- errors
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (CheckpointError("a\nbroken  file", code="checkpoint_truncated"), "a broken file [checkpoint_truncated]"),
+        (FileNotFoundError(2, "No such file or directory", "x.png"), "x.png: No such file or directory"),
+        (PermissionError(13, "Permission denied", "x.png"), "x.png: Permission denied"),
+        (OSError(28, "No space left on device"), "No space left on device"),
+        (OSError("something else"), "something else"),
+    ],
+)
+def test_errors_become_one_line_and_exit_code_2(
+    ask: Ask, pair: PairFolder, monkeypatch: pytest.MonkeyPatch, error: Exception, line: str
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr("viflow_anomaly.cli.detect.load_detector", fail)
+    answer = ask(pair.arguments())
+    assert (answer.code, answer.out, answer.err) == (2, "", f"error: {line}\n")
+
+
+def test_interrupt_gives_130(ask: Ask, pair: PairFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("viflow_anomaly.cli.detect.load_detector", interrupt)
+    answer = ask(pair.arguments())
+    assert (answer.code, answer.out, answer.err) == (130, "", "")
+
+
+def test_a_reader_that_goes_away_is_no_error() -> None:
+    command = Path(sys.executable).with_name("viflow-anomaly")
+    done = subprocess.run(
+        ["bash", "-c", f"{command} schema | true; exit ${{PIPESTATUS[0]}}"], capture_output=True, text=True, check=False
+    )
+    assert done.stderr == ""
+
+
+def test_main_keeps_idle_threads_from_spinning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["viflow-anomaly", "--version"])
+    for before, after in ((None, "PASSIVE"), ("ACTIVE", "ACTIVE")):
+        if before is None:
+            monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+        else:
+            monkeypatch.setenv("OMP_WAIT_POLICY", before)
+        with pytest.raises(SystemExit) as ended:
+            cli_main.main()
+        assert ended.value.code == 0
+        assert os.environ["OMP_WAIT_POLICY"] == after
+
+
+def test_progress_is_silent_where_nobody_watches(capsys: pytest.CaptureFixture[str]) -> None:
+    with stderr_progress() as progress:
+        progress.update(progress.add_task("pairs", total=2), completed=1)
+    assert capsys.readouterr() == ("", "")
+
+
+# --- commands that hand over to other parts
+
+
+def stand_in(monkeypatch: pytest.MonkeyPatch, name: str, **functions: Any) -> None:
+    """A module of another part, with functions of ours."""
+    module = ModuleType(name)
+    vars(module).update(functions)
+    monkeypatch.setitem(sys.modules, name, module)
+
+
+def test_simulate_hands_its_settings_over(ask: Ask, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+
+    def simulate(config: Any, out: Path, *, on_progress: Any) -> list[Path]:
+        asked.append(config)
+        on_progress(1, 2)
+        return [out / "car_000007"]
+
+    monkeypatch.setattr("viflow_anomaly.simulator.simulate", simulate)
+    what = ["--rig", "car", "--sequences", "2", "--frames", "9", "--seed", "7", "--jobs", "1"]
+    answer = ask(["simulate", *what, "--out", str(tmp_path), "--set", "simulator.ground_truth=false"])
+    assert (answer.code, answer.out, answer.err) == (0, f"{tmp_path / 'car_000007'}\n", "")
+    config = asked[0]
+    assert (config.rig, config.sequences, config.frames, config.seed) == ("car", 2, 9, 7)
+    assert config.ground_truth is False
+
+
+def test_simulate_refuses_bad_settings(ask: Ask, tmp_path: Path) -> None:
+    assert ask(["simulate", "--rig", "boat", "--out", str(tmp_path)]).is_refusal("Invalid value for '--rig'")
+    assert ask(["simulate", "--frames", "1", "--out", str(tmp_path)]).is_refusal("Invalid value for '--frames'")
+    answer = ask(["simulate", "--out", str(tmp_path), "--set", "simulator.movers=[3,1]"])
+    assert answer.is_refusal("movers: expected 0 <= least <= most <= 8")
+
+
+def test_train_hands_its_settings_over(ask: Ask, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, Any] = {}
+
+    def train(data: list[Path], out: Path, **options: Any) -> Path:
+        asked.update(options, data=data)
+        return out / "final"
+
+    stand_in(monkeypatch, "viflow_anomaly.training", train=train)
+    how = ["--steps", "5", "--batch-size", "2", "--seed", "3", "--threads", "2", "--set", "model.hypotheses=4"]
+    answer = ask(["train", "a", "b", "--validation", "c", "--out", str(tmp_path), "--resume", *how])
+    assert (answer.code, answer.out) == (0, f"{tmp_path / 'final'}\n")
+    assert (asked["data"], asked["validation"]) == ([Path("a"), Path("b")], [Path("c")])
+    training = asked["training"]
+    assert (training.steps, training.batch_size, training.seed, training.threads) == (5, 2, 3, 2)
+    assert asked["model"].hypotheses == 4
+    assert (asked["resume"], asked["device"], asked["progress"]) == (True, "cpu", False)
+
+
+def test_serve_hands_its_settings_over(ask: Ask, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    stand_in(monkeypatch, "viflow_anomaly_service.server", run=asked.append)
+    answer = ask(
+        ["serve", "--port", "0", "--host", "127.0.0.2", "--threads", "2", "--set", "detector.include_masks=true"]
+    )
+    assert (answer.code, answer.err) == (0, "")
+    settings = asked[0]
+    assert (settings.host, settings.port, settings.threads) == ("127.0.0.2", 0, 2)
+    assert settings.detector.include_masks is True
+
+
+def test_serve_refuses_bad_settings(ask: Ask, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert ask(["serve", "--port", "70000"]).is_refusal("Invalid value for '--port'")
+    monkeypatch.setenv("VIFLOW_MAX_CONCURRENT", "0")
+    assert ask(["serve"]).is_refusal("[config_invalid]")
