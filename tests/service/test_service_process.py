@@ -22,6 +22,7 @@ from service_world import json_request, wait_until
 
 from viflow_anomaly.errors import CheckpointError, ConfigError
 from viflow_anomaly_service import server as service_server
+from viflow_anomaly_service.__main__ import main
 from viflow_anomaly_service.settings import ServiceSettings
 
 SERVE_BY_RULE = """
@@ -137,3 +138,19 @@ def test_bind_both_families_and_refuses_what_is_not_ours() -> None:
 def test_importing_the_service_loads_no_torch() -> None:
     code = "import sys, viflow_anomaly_service.server; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0
+
+
+def test_main_turns_errors_into_a_status(
+    untouched_logging: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("VIFLOW_PORT", "-5")
+    assert main() == 2
+    assert capsys.readouterr().err.startswith("error: service settings: port")
+
+
+def test_main_ends_with_status_0(monkeypatch: pytest.MonkeyPatch) -> None:
+    served: list[ServiceSettings] = []
+    monkeypatch.setenv("VIFLOW_PORT", "1234")
+    monkeypatch.setattr("viflow_anomaly_service.__main__.run", served.append)
+    assert main() == 0
+    assert [settings.port for settings in served] == [1234]
