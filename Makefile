@@ -10,6 +10,8 @@ SHELL := /bin/bash
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
+# Holds for the packages that build ours, too.
+export PIP_CONSTRAINT := constraints.txt
 # On Linux this index has the CPU build of torch (200 MB); PyPI's is a CUDA build of gigabytes.
 TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 
@@ -30,24 +32,25 @@ MODEL_JOBS ?= 1
 .PHONY: demo test lint model wheel clean distclean
 
 $(VENV)/.torch: constraints.txt
-	python=; for name in $(PYTHON) python3.11 python3 python3.12 python3.13; do \
+	@echo 'making $(VENV) with torch (once, some minutes)'
+	@python=; for name in $(PYTHON) python3.11 python3 python3.12 python3.13; do \
 	  if $$name -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; then python=$$name; break; fi; \
 	done; \
 	[[ -n "$$python" ]] || { echo "error: expected Python 3.11 or later as python3.11 or python3; name another one with: make PYTHON=/path/to/python3" >&2; exit 1; }; \
 	[[ -x $(BIN)/python ]] || "$$python" -m venv $(VENV)
-	index=; \
+	@index=; \
 	if [[ "$$(uname -s)" == Linux ]] && $(BIN)/python -c "import urllib.request as u; u.urlopen('$(TORCH_CPU_INDEX)/torch/', timeout=5)" 2>/dev/null; \
 	then index="--extra-index-url $(TORCH_CPU_INDEX)"; fi; \
-	$(PIP) install --quiet --constraint constraints.txt $$index torch
-	touch $@
+	$(PIP) install --quiet $$index torch
+	@touch $@
 
 $(VENV)/.installed: $(VENV)/.torch pyproject.toml
-	$(PIP) install --quiet --constraint constraints.txt --editable .
-	touch $@
+	$(PIP) install --quiet --editable .
+	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(PIP) install --quiet --constraint constraints.txt --editable '.[dev]'
-	touch $@
+	$(PIP) install --quiet --editable '.[dev]'
+	@touch $@
 
 demo: $(VENV)/.installed
 	$(BIN)/viflow-anomaly batch $(DEMO_SAMPLE) --out $(DEMO_OUT) --overwrite --overlays all
