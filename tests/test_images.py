@@ -113,6 +113,7 @@ def test_progressive_jpeg_with_restarts_and_trailing_bytes() -> None:
 def test_fill_bytes_and_standalone_markers_before_a_segment() -> None:
     np.testing.assert_array_equal(decode(JPEG[:2] + b"\xff\xff" + JPEG[2:]), decode(JPEG))
     np.testing.assert_array_equal(decode(JPEG[:-2] + b"\xff\xff\xd9"), decode(JPEG))
+    np.testing.assert_array_equal(decode(JPEG[:2] + b"\xff\x01" + JPEG[2:]), decode(JPEG))
 
 
 def test_empty() -> None:

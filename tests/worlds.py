@@ -1,7 +1,6 @@
 """Synthetic recordings for tests: a textured panorama seen by a camera that turns right, with the IMU that feels it.
 
-One ``World`` is written in any of the layouts that the readers know. By default everything moves 2 px to the left
-between two frames at 20 Hz; a square of its own texture can move independently.
+One ``World`` is written in any layout that the readers know. By default everything moves 2 px to the left a frame.
 """
 
 from __future__ import annotations

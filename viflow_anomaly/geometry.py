@@ -27,7 +27,7 @@ def so3_exp(rotation_vector: Float64Array) -> Float64Array:
 
 def so3_log(rotation: Float64Array) -> Float64Array:
     """Rotation matrix [3, 3] -> rotation vector [3] (rad), angle in [0, pi]."""
-    return np.asarray(cv2.Rodrigues(np.asarray(rotation, dtype=np.float64))[0]).reshape(3)
+    return np.asarray(cv2.Rodrigues(np.asarray(rotation, dtype=np.float64))[0], dtype=np.float64).reshape(3)
 
 
 def integrate_gyro(timestamps_ns: NDArray[np.int64], gyro_rad_s: Float64Array) -> Float64Array:
@@ -50,7 +50,9 @@ def pixel_grid(height: int, width: int) -> Float32Array:
     return np.stack([u, v], axis=-1)
 
 
-def _distort(camera: PinholeCamera, x: Float64Array, y: Float64Array) -> tuple[Float64Array, Float64Array]:
+def _distort(
+    camera: PinholeCamera, x: NDArray[np.floating], y: NDArray[np.floating]
+) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     k = camera.distortion_coeffs
     r2 = x * x + y * y
     if camera.distortion_model == "equidistant":
