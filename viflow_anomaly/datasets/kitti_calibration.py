@@ -18,8 +18,8 @@ ASPECT_TOLERANCE = 0.02
 OFFICIAL_RECT_SIZE = (1242.0, 375.0)
 
 # Where an odometry sequence has no calib_imu_to_velo.txt: KITTI's published sensor plan, good to about a degree and
-# 5 cm. IMU x front, y left, z top; camera x right, y down, z front; the IMU sits 0.32 m left of, 0.72 m above (camera y
-# is down, so the IMU's origin has y = +0.72 below) and 1.08 m behind image_0.
+# 5 cm. IMU x front, y left, z top; camera x right, y down, z front; seen from image_0 the IMU lies 0.32 m to the left,
+# 0.72 m below and 1.08 m behind.
 NOMINAL_T_CAM0_IMU = np.array(
     [[0.0, -1.0, 0.0, -0.32], [0.0, 0.0, -1.0, 0.72], [1.0, 0.0, 0.0, -1.08], [0.0, 0.0, 0.0, 1.0]]
 )
