@@ -20,6 +20,10 @@ class ViflowError(Exception):
         self.code = code
         self.field = field
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickled with code and field: an error raised in a worker process reaches its parent whole."""
+        return _rebuilt, (type(self), self.message, self.code, self.field)
+
     @property
     def message(self) -> str:
         return str(self.args[0])
@@ -51,3 +55,7 @@ class CheckpointError(ViflowError):
 
 class MissingDependencyError(ViflowError):
     """An optional package is needed; the message gives the install line."""
+
+
+def _rebuilt(kind: type[ViflowError], message: str, code: str, field: str | None) -> ViflowError:
+    return kind(message, code=code, field=field)

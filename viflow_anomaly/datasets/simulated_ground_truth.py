@@ -7,7 +7,7 @@ Flow PNGs are KITTI's: 16 bit, three channels, value = 64 * flow + 2^15, third c
 from __future__ import annotations
 
 import csv
-import os
+import itertools
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -61,7 +61,7 @@ def _write_png(path: Path, image: NDArray[Any]) -> None:
     assert encoded
     partial = path.with_name(path.name + ".partial")
     partial.write_bytes(data.tobytes())
-    os.replace(partial, path)
+    partial.replace(path)
 
 
 def _read_png(path: Path, channels: int, kind: str, dtype: type[np.unsignedinteger[Any]]) -> NDArray[Any]:
@@ -191,12 +191,11 @@ class SimulatedGroundTruth:
         stamps, rows = [], []
         for number, row in _csv_rows(path):
             try:
-                stamps.append(int(row[0]))
-                rows.append([float(value) for value in row[1:8]])
-                if len(rows[-1]) != 7:
-                    raise ValueError(f"{len(row)} columns")
-            except (ValueError, IndexError) as err:
+                stamp, state = _state_of(row)
+            except ValueError as err:
                 raise _malformed(path, number, "a stamp, a position and a quaternion", row) from err
+            stamps.append(stamp)
+            rows.append(state)
         return np.array(stamps, dtype=np.int64), np.array(rows, dtype=np.float64).reshape(-1, 7)
 
     def camera_pose(self, timestamp_ns: int) -> Float64Array:
@@ -237,7 +236,7 @@ class SimulatedGroundTruth:
     @cached_property
     def _next_stamps(self) -> dict[int, int]:
         stamps = sorted(int(path.stem) for path in (self.folder / "depth").glob("*.png"))
-        return dict(zip(stamps[:-1], stamps[1:], strict=True))
+        return dict(itertools.pairwise(stamps))
 
     def flow(self, source_ns: int) -> tuple[Float32Array, BoolArray]:
         """Flow of everything, movers included, to the next frame: [H, W, 2] and validity [H, W]."""
@@ -258,13 +257,24 @@ class SimulatedGroundTruth:
         found: dict[int, list[MovingObject]] = {}
         for number, row in _csv_rows(path):
             try:
-                if len(row) != len(OBJECT_COLUMNS):
-                    raise ValueError(f"{len(row)} columns")
-                thing = MovingObject(*(int(value) for value in row[:7]), float(row[7]))
+                thing = _object_of(row)
             except ValueError as err:
                 raise _malformed(path, number, ",".join(OBJECT_COLUMNS), row) from err
             found.setdefault(thing.timestamp_ns, []).append(thing)
         return found
+
+
+def _state_of(row: list[str]) -> tuple[int, list[float]]:
+    if len(row) < 8:
+        raise ValueError(f"{len(row)} columns")
+    return int(row[0]), [float(value) for value in row[1:8]]
+
+
+def _object_of(row: list[str]) -> MovingObject:
+    if len(row) != len(OBJECT_COLUMNS):
+        raise ValueError(f"{len(row)} columns")
+    stamp, number, area, u_min, v_min, u_max, v_max = (int(value) for value in row[:7])
+    return MovingObject(stamp, number, area, u_min, v_min, u_max, v_max, float(row[7]))
 
 
 def _malformed(path: Path, line: int, expected: str, row: list[str]) -> DatasetError:

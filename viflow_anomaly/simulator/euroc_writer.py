@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from viflow_anomaly.sensor_data import Float64Array
 from viflow_anomaly.simulator.imu import ImuRecord
-from viflow_anomaly.simulator.motion import BodyMotion
-from viflow_anomaly.simulator.rendering import quaternions_wxyz
+from viflow_anomaly.simulator.motion import BodyMotion, quaternions_wxyz
 from viflow_anomaly.simulator.rigs import Rig
 
 Int64Array = NDArray[np.int64]

@@ -23,7 +23,7 @@ class Harmonics:
         cls, rng: np.random.Generator, *, frequencies_hz: tuple[float, float], count: int = 6, slope: float = 1.0
     ) -> Self:
         """Frequencies log-uniform within the band, amplitudes falling as frequency^-slope."""
-        frequencies = np.exp(rng.uniform(*np.log(frequencies_hz), size=count))
+        frequencies = np.exp(rng.uniform(np.log(frequencies_hz[0]), np.log(frequencies_hz[1]), size=count))
         amplitudes = rng.uniform(0.5, 1.0, count) * (frequencies / frequencies_hz[0]) ** -slope
         return cls(amplitudes, 2 * np.pi * frequencies, rng.uniform(0, 2 * np.pi, count))
 

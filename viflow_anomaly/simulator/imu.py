@@ -25,7 +25,7 @@ def _wandering_bias(
     rng: np.random.Generator, start: Float64Array, random_walk: float, count: int, step_s: float
 ) -> Float64Array:
     steps = rng.standard_normal((count, 3)) * random_walk * np.sqrt(step_s)
-    return start + np.cumsum(steps, axis=0)
+    return np.asarray(start + np.cumsum(steps, axis=0))
 
 
 def measure(rng: np.random.Generator, motion: BodyMotion, errors: ImuErrors, rate_hz: int) -> ImuRecord:

@@ -99,3 +99,29 @@ def mounted(
         R_world_vehicle @ R_vehicle_imu,
         rates_vehicle_rad_s @ R_vehicle_imu,
     )
+
+
+def quaternion_wxyz(rotation: Float64Array) -> Float64Array:
+    """Rotation [3, 3] -> unit quaternion [4] w x y z, by the largest of the four (never divides by a small number)."""
+    m = rotation
+    squares = np.array(
+        [
+            1 + m[0, 0] + m[1, 1] + m[2, 2],
+            1 + m[0, 0] - m[1, 1] - m[2, 2],
+            1 - m[0, 0] + m[1, 1] - m[2, 2],
+            1 - m[0, 0] - m[1, 1] + m[2, 2],
+        ]
+    )
+    a, b, c = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    d, e, f = m[1, 0] + m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2]
+    rows = np.array([[squares[0], a, b, c], [a, squares[1], d, e], [b, d, squares[2], f], [c, e, f, squares[3]]])
+    best = rows[int(np.argmax(squares))]
+    return np.asarray(best / np.linalg.norm(best))
+
+
+def quaternions_wxyz(rotations: Float64Array) -> Float64Array:
+    """[N, 3, 3] -> [N, 4] unit quaternions w x y z, each on its predecessor's side."""
+    result = np.stack([quaternion_wxyz(rotation) for rotation in rotations])
+    flips = np.cumprod(np.where((result[1:] * result[:-1]).sum(axis=1) < 0, -1.0, 1.0))
+    result[1:] *= flips[:, None]
+    return result

@@ -1,4 +1,4 @@
-"""Things that move on their own: tumbling objects in a drone's view; cars, cyclists and walkers on a road."""
+"""Things that move on their own in a drone's view. For road users see ``traffic``."""
 
 from __future__ import annotations
 
@@ -6,15 +6,13 @@ import numpy as np
 
 from viflow_anomaly.geometry import so3_exp
 from viflow_anomaly.sensor_data import Float64Array, PinholeCamera
-from viflow_anomaly.simulator.road import Road
-from viflow_anomaly.simulator.scene import Mover, Solid
-from viflow_anomaly.simulator.shapes import car, compound, cyclist, pedestrian, turned
+from viflow_anomaly.simulator.scene import Mover
+from viflow_anomaly.simulator.shapes import compound
 
 WAYPOINT_S = 1.5
 SPEED_M_S = (0.3, 3.0)
 DISTANCES_M = (1.2, 8.0)
 AIR_CLEARANCE_M = 0.6
-ROAD_CLEARANCE_M = 4.5
 
 
 def _catmull_rom(knots: Float64Array, at: Float64Array) -> Float64Array:
@@ -107,114 +105,14 @@ def airborne_movers(
             if distances.min() > mover.radius_m() + AIR_CLEARANCE_M:
                 break
         else:
-            mover = _parked_ahead(mover, poses)
+            mover = _lifted_over(mover, poses)
         movers.append(mover)
     return tuple(movers)
 
 
-def _parked_ahead(mover: Mover, poses: Float64Array) -> Mover:
+def _lifted_over(mover: Mover, poses: Float64Array) -> Mover:
     """Last resort for a path that cannot avoid the camera: the same motion, lifted above the camera's."""
     lift = np.array(
         [0.0, 0.0, poses[:, 2, 3].max() + mover.radius_m() + AIR_CLEARANCE_M - mover.positions_m[:, 2].min()]
     )
     return Mover(mover.solids, mover.positions_m + lift, mover.rotations)
-
-
-def _along(
-    road: Road, s: Float64Array, lateral: Float64Array | float, backwards: bool
-) -> tuple[Float64Array, Float64Array]:
-    """Positions [F, 3] and rotations [F, 3, 3] of something that follows the road."""
-    headings = road.heading(s) + (np.pi if backwards else 0.0)
-    place = road.position(s, lateral)
-    return np.column_stack([place, np.full(len(s), 0.02)]), np.stack([turned(float(h)) for h in headings])
-
-
-def _road_user(
-    rng: np.random.Generator,
-    road: Road,
-    arc_m: Float64Array,
-    times_s: Float64Array,
-    left_lane_m: float,
-    edge_m: float,
-    names: list[str],
-) -> Mover:
-    speed = float(np.ptp(arc_m) / max(np.ptp(times_s), 1e-6))
-    meeting = rng.uniform(0.1, 0.95) * times_s[-1]  # when it is right before us
-    arc_then = float(np.interp(meeting, times_s, arc_m))
-    kind = rng.choice(5, p=(0.3, 0.3, 0.12, 0.16, 0.12))
-    if kind == 0:  # ahead in our lane
-        gap, relative = rng.uniform(8.0, 30.0), rng.normal(0, 1.5)
-        s = arc_m + gap + relative * (times_s - times_s.mean())
-        return Mover(car(rng, names), *_along(road, s, rng.normal(0, 0.2), False))
-    if kind == 1:  # oncoming
-        s = arc_then + rng.uniform(2.0, 40.0) - rng.uniform(0.5, 1.2) * max(speed, 4.0) * (times_s - meeting)
-        return Mover(car(rng, names), *_along(road, s, left_lane_m + rng.normal(0, 0.2), True))
-    if kind == 2:  # crossing ahead
-        s_cross = arc_then + rng.uniform(14.0, 35.0)
-        pace = rng.uniform(3.0, 9.0) * rng.choice((-1, 1))
-        lateral = pace * (times_s - meeting) + rng.uniform(-5, 5)
-        place, rotations = _along(road, np.full(len(times_s), s_cross), lateral, False)
-        return Mover(car(rng, names), place, rotations @ turned(np.sign(pace) * np.pi / 2))
-    walker = rng.random() < 0.6
-    thing: tuple[Solid, ...] = pedestrian(rng, names) if walker else cyclist(rng, names)
-    pace = rng.uniform(0.7, 2.2) if walker else rng.uniform(2.5, 6.0)
-    if kind == 3:  # along the kerb
-        side = rng.choice((-1, 1))
-        s = arc_then + rng.uniform(6.0, 22.0) + side * -pace * (times_s - meeting)
-        lateral_m = -edge_m - rng.uniform(0, 1.2) if side < 0 else 2 * left_lane_m - rng.uniform(-0.5, 0.8)
-        return Mover(thing, *_along(road, s, lateral_m, bool(side > 0)))
-    pace *= rng.choice((-1, 1))
-    s_cross = arc_then + rng.uniform(9.0, 25.0)
-    place, rotations = _along(
-        road, np.full(len(times_s), s_cross), pace * (times_s - meeting) + rng.uniform(-3, 4), False
-    )
-    return Mover(thing, place, rotations @ turned(np.sign(pace) * np.pi / 2))
-
-
-def road_movers(
-    rng: np.random.Generator,
-    count: int,
-    road: Road,
-    camera_path_m: Float64Array,
-    arc_m: Float64Array,
-    times_s: Float64Array,
-    lanes_m: tuple[float, float],
-    names: list[str],
-) -> tuple[Mover, ...]:
-    """``count`` road users that never come within 2.5 m of the camera.
-
-    Args:
-        camera_path_m: [F, 3]; arc_m: [F] where the camera is along the road; times_s: [F], first 0.
-        lanes_m: middle of the oncoming lane to the left, edge of the road to the right (both positive).
-    """
-    movers: list[Mover] = []
-    while len(movers) < count:
-        for _ in range(40):
-            mover = _road_user(rng, road, arc_m, times_s, *lanes_m, names)
-            clear = all(
-                float(np.linalg.norm((mover.positions_m - camera_path_m)[:, :2], axis=1).min()) > 2.5
-                and _separate(mover, other)
-                for other in (*movers, mover)
-            )
-            if clear and _keeps_ahead(mover, camera_path_m):
-                break
-        else:
-            return tuple(movers)
-        movers.append(mover)
-    return tuple(movers)
-
-
-def _keeps_ahead(mover: Mover, camera_path_m: Float64Array) -> bool:
-    """Its solids, as boxes, stay clear of the camera by more than a bumper's length."""
-    for frame in range(0, len(camera_path_m)):
-        local = mover.rotations[frame].T @ (camera_path_m[frame] - mover.positions_m[frame])
-        if any(solid.clearance_m(local[None]) < 1.5 for solid in mover.solids):
-            return False
-    return True
-
-
-def _separate(mover: Mover, other: Mover) -> bool:
-    if mover is other:
-        return True
-    gaps = np.linalg.norm((mover.positions_m - other.positions_m)[:, :2], axis=1)
-    return bool(gaps.min() > 2.0)

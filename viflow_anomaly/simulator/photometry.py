@@ -46,7 +46,10 @@ class Photometry:
 def draw_photometry(
     rng: np.random.Generator, camera: PinholeCamera, probes: list[Uint8Array], times_s: NDArray[np.float64]
 ) -> Photometry:
-    """Draw a camera response; the exposure brings the probe images' mean to 80-140 unless too much of them (5 to 45 %) would burn out."""
+    """Draw a camera response.
+
+    The exposure brings the mean of the probe images to 80-140 unless 5 to 45 % of their pixels would burn out.
+    """
     offsets = pixel_grid(camera.height, camera.width) - np.array([camera.cx, camera.cy], np.float32)
     radius2 = (offsets**2).sum(axis=-1)
     vignette = 1.0 - rng.uniform(0.0, 0.35) * radius2 / radius2.max()

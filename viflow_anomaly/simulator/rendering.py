@@ -1,199 +1,23 @@
-"""MuJoCo as a renderer: a scene becomes a model, a camera pose becomes a gray image or depth and instances.
-
-The only file that touches mujoco and GL. mujoco is optional and imported late, after MUJOCO_GL is settled.
-"""
+"""A camera pose becomes a gray image, or depth and instance numbers, drawn by MuJoCo."""
 
 from __future__ import annotations
 
-import ctypes.util
-import os
-import sys
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from viflow_anomaly.errors import MissingDependencyError
 from viflow_anomaly.sensor_data import Float64Array, PinholeCamera, Uint8Array
-from viflow_anomaly.simulator.scene import Material, Scene, Solid
+from viflow_anomaly.simulator.gl import gl_missing, load_mujoco
+from viflow_anomaly.simulator.motion import quaternion_wxyz
+from viflow_anomaly.simulator.mujoco_model import NEAR_M, build_model
+from viflow_anomaly.simulator.scene import Scene
 
-NEAR_M = 0.05
-SKY_FACES = 6
-PLANE_CELLS = 10
 HIDDEN_GROUP = 5  # of MuJoCo's geom groups: not drawn by default
 # MuJoCo cameras look along -z with y up; ours along +z with y down.
 R_CAMERA_GL = np.diag([1.0, -1.0, -1.0])
-
-
-def load_mujoco() -> Any:
-    """Import mujoco with an offscreen GL backend: MUJOCO_GL as the user set it, else EGL, else OSMesa.
-
-    Raises:
-        MissingDependencyError: ``mujoco_missing`` (with the install line) or ``gl_missing`` (with the packages).
-    """
-    if sys.platform == "linux" and not os.environ.get("MUJOCO_GL"):
-        os.environ["MUJOCO_GL"] = _offscreen_backend()
-    try:
-        import mujoco  # noqa: PLC0415
-    except ModuleNotFoundError as err:
-        if err.name != "mujoco":
-            raise
-        raise MissingDependencyError(
-            'the simulator needs mujoco, which is not installed: pip install "viflow-anomaly[simulate]"',
-            code="mujoco_missing",
-        ) from err
-    except (ImportError, AttributeError, OSError, RuntimeError) as err:  # PyOpenGL without its library
-        raise _gl_missing(str(err)) from err
-    return mujoco
-
-
-def _offscreen_backend() -> str:
-    for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
-        if ctypes.util.find_library(library):
-            return backend
-    raise _gl_missing("neither libEGL nor libOSMesa was found")
-
-
-def _gl_missing(problem: str) -> MissingDependencyError:
-    return MissingDependencyError(
-        "the simulator needs OpenGL without a display: install the Debian packages libegl1 and libgl1-mesa-dri, or "
-        f"libosmesa6, or set MUJOCO_GL yourself (now {os.environ.get('MUJOCO_GL')!r}); found: {problem}",
-        code="gl_missing",
-    )
-
-
-def _quaternion(rotation: Float64Array) -> Float64Array:
-    """[3, 3] -> unit quaternion w x y z, by the largest of the four (never divides by a small number)."""
-    m = rotation
-    squares = np.array(
-        [
-            1 + m[0, 0] + m[1, 1] + m[2, 2],
-            1 + m[0, 0] - m[1, 1] - m[2, 2],
-            1 - m[0, 0] + m[1, 1] - m[2, 2],
-            1 - m[0, 0] - m[1, 1] + m[2, 2],
-        ]
-    )
-    a, b, c = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
-    d, e, f = m[1, 0] + m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2]
-    rows = np.array([[squares[0], a, b, c], [a, squares[1], d, e], [b, d, squares[2], f], [c, e, f, squares[3]]])
-    best = rows[int(np.argmax(squares))]
-    return np.asarray(best / np.linalg.norm(best))
-
-
-def quaternions_wxyz(rotations: Float64Array) -> Float64Array:
-    """[N, 3, 3] -> [N, 4] unit quaternions w x y z, each on its predecessor's side."""
-    result = np.stack([_quaternion(rotation) for rotation in rotations])
-    flips = np.cumprod(np.where((result[1:] * result[:-1]).sum(axis=1) < 0, -1.0, 1.0))
-    result[1:] *= flips[:, None]
-    return result
-
-
-def _add_texture(spec: Any, name: str, image: Uint8Array, kind: Any, faces: int) -> None:
-    side = image.shape[0]
-    texture = spec.add_texture(name=name, type=kind, width=side, height=side * faces, nchannel=3)
-    texture.data = np.repeat(np.tile(image, (faces, 1))[..., None], 3, axis=2).tobytes()
-
-
-def _add_material(mujoco: Any, spec: Any, material: Material) -> None:
-    kinds = mujoco.mjtTexture
-    kind = kinds.mjTEXTURE_CUBE if material.mapping == "wrap" else kinds.mjTEXTURE_2D
-    _add_texture(spec, material.name, material.image, kind, 1)
-    made = spec.add_material(name=material.name)
-    made.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = material.name
-    made.texrepeat = list(material.repeat)
-    made.specular = material.specular
-    made.shininess = 0.3
-    made.reflectance = 0.0
-
-
-def _add_solid(mujoco: Any, body: Any, solid: Solid) -> None:
-    shapes = mujoco.mjtGeom
-    size = list(solid.size_m)
-    if solid.shape == "plane":
-        size[2] = max(size[:2]) / PLANE_CELLS  # the third size is the spacing of the drawn grid
-    body.add_geom(
-        type=getattr(shapes, f"mjGEOM_{solid.shape.upper()}"),
-        size=size,
-        pos=solid.position_m,
-        quat=_quaternion(solid.rotation),
-        material=solid.material,
-        contype=0,
-        conaffinity=0,
-    )
-
-
-def _add_strips(mujoco: Any, spec: Any, scene: Scene) -> None:
-    for index, strip in enumerate(scene.strips):
-        mesh = spec.add_mesh(name=f"strip{index}")
-        mesh.uservert = strip.vertices_m.ravel()
-        mesh.userface = strip.faces.ravel().astype(np.int32)
-        mesh.usertexcoord = strip.texture_coordinates.ravel()
-        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-        spec.worldbody.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=f"strip{index}",
-            material=strip.material,
-            contype=0,
-            conaffinity=0,
-        )
-
-
-def _add_lights(mujoco: Any, spec: Any, scene: Scene) -> None:
-    headlight = spec.visual.headlight
-    headlight.ambient = [scene.ambient] * 3
-    headlight.diffuse = [scene.headlight] * 3
-    headlight.specular = [0.0] * 3
-    kinds = mujoco.mjtLightType
-    for light in scene.lights:
-        made = spec.worldbody.add_light()
-        made.type = kinds.mjLIGHT_DIRECTIONAL if light.position_m is None else kinds.mjLIGHT_POINT
-        made.pos = np.zeros(3) if light.position_m is None else light.position_m
-        made.dir = light.direction
-        made.diffuse = [light.diffuse] * 3
-        made.ambient = [0.0] * 3
-        made.specular = [0.2] * 3
-        made.attenuation = [1.0, 0.0, 0.0] if light.position_m is None else [0.6, 0.05, 0.01]
-        made.castshadow = False
-
-
-def _add_camera(spec: Any, camera: PinholeCamera) -> None:
-    body = spec.worldbody.add_body(name="camera", mocap=True)
-    body.add_camera(
-        name="camera",
-        resolution=[camera.width, camera.height],
-        sensor_size=[camera.width, camera.height],
-        focal_pixel=[camera.fx, camera.fy],
-        # Offsets from the middle of the image; integer pixel centres put that at (size - 1) / 2. Signs are tested.
-        principal_pixel=[camera.cx - (camera.width - 1) / 2, camera.cy - (camera.height - 1) / 2],
-    )
-
-
-def build_model(mujoco: Any, scene: Scene, camera: PinholeCamera, supersampling: int) -> Any:
-    """Compile the scene; mocap bodies: ``camera`` and ``mover1``..``moverN``."""
-    spec = mujoco.MjSpec()
-    spec.visual.global_.offwidth = camera.width * supersampling
-    spec.visual.global_.offheight = camera.height * supersampling
-    spec.visual.quality.offsamples = 0
-    spec.visual.quality.shadowsize = 0
-    spec.visual.quality.numslices, spec.visual.quality.numstacks = 20, 12
-    spec.visual.map.znear, spec.visual.map.zfar = NEAR_M, scene.far_m
-    spec.stat.extent = 1.0
-    for material in scene.materials:
-        _add_material(mujoco, spec, material)
-    if scene.sky is not None:
-        _add_texture(spec, "sky", scene.sky, mujoco.mjtTexture.mjTEXTURE_SKYBOX, SKY_FACES)
-    for solid in scene.solids:
-        _add_solid(mujoco, spec.worldbody, solid)
-    _add_strips(mujoco, spec, scene)
-    _add_lights(mujoco, spec, scene)
-    _add_camera(spec, camera)
-    for number, mover in enumerate(scene.movers, start=1):
-        body = spec.worldbody.add_body(name=f"mover{number}", mocap=True)
-        for solid in mover.solids:
-            _add_solid(mujoco, body, solid)
-    return spec.compile()
 
 
 class SceneRenderer:
@@ -213,7 +37,7 @@ class SceneRenderer:
             self._gl = mujoco.GLContext(width, height)
             self._gl.make_current()
         except (ImportError, AttributeError, OSError, RuntimeError) as err:
-            raise _gl_missing(str(err)) from err
+            raise gl_missing(str(err)) from err
         self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
@@ -244,7 +68,7 @@ class SceneRenderer:
     def _set_mocap(self, body: str, position: Float64Array, rotation: Float64Array) -> None:
         index = int(self._model.body(body).mocapid[0])
         self._data.mocap_pos[index] = position
-        self._data.mocap_quat[index] = _quaternion(rotation)
+        self._data.mocap_quat[index] = quaternion_wxyz(rotation)
 
     def place(self, T_world_cam: Float64Array, frame: int) -> None:
         """Put the camera there and every mover where it is at that frame."""

@@ -37,7 +37,7 @@ class ImuErrors:
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """One sequence's hardware. ``camera.T_cam_imu`` is the mounting, ``R_vehicle_imu`` [3, 3] the IMU in vehicle axes."""
+    """One sequence's hardware: ``camera.T_cam_imu`` and its inverse, ``R_vehicle_imu`` [3, 3] (IMU to vehicle axes)."""
 
     camera: PinholeCamera
     T_imu_cam: Float64Array

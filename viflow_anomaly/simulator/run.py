@@ -14,7 +14,7 @@ from typing import Any
 
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.simulator.config import SimulatorConfig
-from viflow_anomaly.simulator.rendering import load_mujoco
+from viflow_anomaly.simulator.gl import load_mujoco
 from viflow_anomaly.simulator.sequence import write_sequence
 
 WORLD_VERSION = 1  # raised whenever the same seed gives other bytes
@@ -106,7 +106,7 @@ def _one_thread_each() -> None:
 
 
 def _write_one(config: SimulatorConfig, seed: int, place: Path) -> None:
-    partial = place.with_name(f".{place.name}.partial-{os.getpid()}")
+    partial = place.with_name(f".{place.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     try:

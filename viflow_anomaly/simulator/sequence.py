@@ -24,14 +24,16 @@ from viflow_anomaly.simulator.flight import fly
 from viflow_anomaly.simulator.ground_truth import flow_truth, visible_objects
 from viflow_anomaly.simulator.imu import measure
 from viflow_anomaly.simulator.motion import BodyMotion
-from viflow_anomaly.simulator.movers import airborne_movers, road_movers
+from viflow_anomaly.simulator.movers import airborne_movers
 from viflow_anomaly.simulator.photometry import draw_photometry
 from viflow_anomaly.simulator.rendering import SceneRenderer
 from viflow_anomaly.simulator.rigs import Rig, draw_rig
 from viflow_anomaly.simulator.road import Road
+from viflow_anomaly.simulator.roadside import Layout
 from viflow_anomaly.simulator.scene import Scene
-from viflow_anomaly.simulator.street import Layout, street
+from viflow_anomaly.simulator.street import street
 from viflow_anomaly.simulator.surroundings import object_materials, open_air, room
+from viflow_anomaly.simulator.traffic import Traffic
 
 EPOCH_NS = 1_500_000_000_000_000_000
 LEAD_S = 0.5  # of IMU before the first frame and after the last
@@ -103,8 +105,12 @@ def build_world(config: SimulatorConfig, seed: int) -> World:
         scene = surroundings(rng_scene, camera_path, movers, materials)
     else:
         layout = Layout.draw(rng_scene)
-        lanes = ((layout.left_edge * 2 + layout.right_edge) / 3, -layout.right_edge)
-        movers = road_movers(rng_movers, count, road, camera_path, arc[frame_indices], frame_times, lanes, names)
+        oncoming = (layout.left_edge * 2 + layout.right_edge) / 3
+        arc_at_frames = arc[frame_indices]
+        traffic = Traffic(
+            rng_movers, road, camera_path, arc_at_frames, frame_times, oncoming, -layout.right_edge, names
+        )
+        movers = traffic.draw(count)
         scene = street(rng_scene, road, layout, camera_path, movers, materials)
     return World(rig, motion, stamps, frame_indices, camera_poses, scene)
 

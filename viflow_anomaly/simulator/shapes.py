@@ -17,6 +17,19 @@ def turned(angle_rad: float) -> Float64Array:
     return np.asarray(axis_rotations(2, np.array([angle_rad]))[0])
 
 
+def sizes(
+    rng: np.random.Generator, low: tuple[float, float, float], high: tuple[float, float, float]
+) -> tuple[float, float, float]:
+    """Three sizes in metres, each uniform within its range."""
+    first, second, third = rng.uniform(low, high)
+    return float(first), float(second), float(third)
+
+
+def raised(place_m: Float64Array, by_m: float) -> Float64Array:
+    """[3], the same place higher up."""
+    return np.asarray(place_m + np.array([0.0, 0.0, by_m]))
+
+
 def box(size_m: tuple[float, float, float], centre_m: Float64Array, rotation: Float64Array, material: str) -> Solid:
     """A box of full size ``size_m``."""
     half = (size_m[0] / 2, size_m[1] / 2, size_m[2] / 2)
@@ -124,7 +137,7 @@ def tree(rng: np.random.Generator, bark: str, leaves: list[str]) -> tuple[Solid,
     height, girth = rng.uniform(2.0, 5.0), rng.uniform(0.1, 0.3)
     parts = [Solid("cylinder", (girth, height / 2, 0.0), np.array([0, 0, height / 2]), UPRIGHT, bark)]
     for _ in range(int(rng.integers(2, 5))):
-        radii = tuple(float(r) for r in rng.uniform(0.7, 1.8, 3))
+        radii = sizes(rng, (0.7, 0.7, 0.7), (1.8, 1.8, 1.8))
         place = np.array([*rng.uniform(-0.9, 0.9, 2), height + rng.uniform(-0.3, 1.2)])
         parts.append(Solid("ellipsoid", radii, place, turned(rng.uniform(0, np.pi)), str(rng.choice(leaves))))
     return tuple(parts)

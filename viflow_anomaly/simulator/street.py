@@ -2,45 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from viflow_anomaly.sensor_data import Float64Array
 from viflow_anomaly.simulator import textures
 from viflow_anomaly.simulator.road import Road
+from viflow_anomaly.simulator.roadside import FACADES, Layout, Roadside
 from viflow_anomaly.simulator.scene import Material, Mover, Scene, Solid, Strip, draw_lights
-from viflow_anomaly.simulator.shapes import UPRIGHT, box, car, compound, moved, tree, turned
+from viflow_anomaly.simulator.shapes import UPRIGHT
 from viflow_anomaly.simulator.surroundings import OBJECT_TEXTURE_PX, SURFACE_TEXTURE_PX, KeepClear
 
 CLEARANCE_M = 2.2
-FACADES = 4
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Lateral positions in metres to the left of the driven line."""
-
-    right_edge: float
-    left_edge: float
-    kerb_width: float
-    houses: float
-    trees: float
-    parked: float
-    poles: float
-
-    @classmethod
-    def draw(cls, rng: np.random.Generator) -> Layout:
-        lane, beside = rng.uniform(2.8, 3.6), rng.uniform(0.5, 2.8)
-        return cls(
-            right_edge=-lane / 2 - beside,
-            left_edge=1.5 * lane + beside,
-            kerb_width=rng.uniform(1.5, 4.0),
-            houses=rng.choice((0.0, 0.5, 0.9)),
-            trees=rng.uniform(0.1, 0.7),
-            parked=rng.choice((0.0, 0.3, 0.7)),
-            poles=rng.uniform(0.2, 0.8),
-        )
 
 
 def _ribbon(
@@ -87,55 +59,6 @@ def _ground(rng: np.random.Generator, road: Road, layout: Layout) -> tuple[list[
     return materials, [ground], strips
 
 
-def _beside(
-    rng: np.random.Generator, road: Road, s: float, side: float, layout: Layout, names: list[str]
-) -> list[tuple[Solid, ...]]:
-    """The things at one place along one side (+1 left, -1 right)."""
-    edge = layout.left_edge if side > 0 else -layout.right_edge
-    heading = float(road.heading(np.array([s]))[0])
-
-    def at(lateral: float, along: float = 0.0, turn: float = 0.0, z: float = 0.08) -> tuple[Float64Array, Float64Array]:
-        place = road.position(np.array([s + along]), side * lateral)[0]
-        return np.array([*place, z]), turned(heading + turn)
-
-    things: list[tuple[Solid, ...]] = []
-    walk = edge + layout.kerb_width
-    if rng.random() < layout.houses:
-        size = (rng.uniform(6, 14), rng.uniform(6, 12), rng.uniform(3.5, 14))
-        place, rotation = at(walk + size[1] / 2 + rng.uniform(0.2, 5.0))
-        things.append((box(size, place + (0, 0, size[2] / 2), rotation, f"facade{rng.integers(FACADES)}"),))
-    if rng.random() < layout.trees:
-        place, rotation = at(
-            edge + rng.uniform(0.6, 1.0) * layout.kerb_width + rng.choice((0.0, 2.0, 8.0)), rng.uniform(-4, 4)
-        )
-        things.append(moved(tree(rng, str(rng.choice(names)), names), place, rotation))
-    if rng.random() < layout.parked:
-        turn = 0.0 if rng.random() < 0.6 else np.pi
-        place, rotation = at(edge + rng.uniform(-1.0, 1.2), rng.uniform(-2, 2), turn + rng.normal(0, 0.04), 0.02)
-        things.append(moved(car(rng, names), place, rotation))
-    if rng.random() < layout.poles:
-        half, radius = rng.uniform(1.2, 3.5), rng.uniform(0.04, 0.15)
-        place, rotation = at(edge + rng.uniform(0.3, 0.8), rng.uniform(-4, 4))
-        pole = Solid("cylinder", (radius, half, 0.0), place + (0, 0, half), UPRIGHT, str(rng.choice(names)))
-        sign = box((0.05, *rng.uniform(0.4, 0.9, 2)), place + (0, 0, 2 * half), rotation, str(rng.choice(names)))
-        things.append((pole, sign) if rng.random() < 0.5 else (pole,))
-    if rng.random() < 0.35:
-        place, rotation = at(walk + rng.uniform(-1.0, 3.0), rng.uniform(-4, 4), rng.uniform(0, np.pi))
-        extent = rng.uniform(0.5, 2.0)
-        things.append(moved(compound(rng, extent, names), place + (0, 0, extent * 0.35), rotation))
-    if rng.random() < 0.9 - 0.6 * layout.houses:  # a tree line, bushes
-        place, rotation = at(walk + rng.uniform(4.0, 35.0), rng.uniform(-5, 5))
-        things.append(moved(tree(rng, str(rng.choice(names)), names), place, rotation))
-        radii = tuple(float(r) for r in rng.uniform(0.4, 1.8, 3))
-        place, rotation = at(walk + rng.uniform(0.5, 14.0), rng.uniform(-5, 5))
-        things.append((Solid("ellipsoid", radii, place + (0, 0, 0.5 * radii[2]), rotation, str(rng.choice(names))),))
-    if rng.random() < 0.25:
-        size = (8.0, 0.12, rng.uniform(0.6, 2.2))
-        place, rotation = at(walk + rng.uniform(0.0, 0.4))
-        things.append((box(size, place + (0, 0, size[2] / 2), rotation, str(rng.choice(names))),))
-    return things
-
-
 def street(
     rng: np.random.Generator,
     road: Road,
@@ -154,7 +77,7 @@ def street(
     for side in (1.0, -1.0):
         s = road.start_m + 25.0
         while s < road.end_m - 10.0:
-            for thing in _beside(rng, road, s, side, layout, object_names):
+            for thing in Roadside(rng, road, s, side, layout, object_names).things():
                 if clear.allows(thing):
                     solids.extend(thing)
             s += rng.uniform(6.0, 12.0)

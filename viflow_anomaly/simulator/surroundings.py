@@ -14,7 +14,7 @@ from viflow_anomaly.sensor_data import Float64Array
 from viflow_anomaly.simulator import textures
 from viflow_anomaly.simulator.motion import axis_rotations
 from viflow_anomaly.simulator.scene import Material, Mover, Scene, Solid, draw_lights
-from viflow_anomaly.simulator.shapes import UPRIGHT, box, compound, moved, tree, turned
+from viflow_anomaly.simulator.shapes import UPRIGHT, box, compound, moved, raised, sizes, tree, turned
 
 CLEARANCE_M = 0.5
 MOVER_CLEARANCE_M = 0.1
@@ -106,7 +106,7 @@ def _shelf(rng: np.random.Generator, place: Float64Array, names: list[str]) -> t
     parts = [box((0.04, depth, height), np.array([x, 0, height / 2]), UPRIGHT, wood) for x in (-width / 2, width / 2)]
     for level in np.linspace(0.1, height - 0.02, int(rng.integers(3, 5))):
         parts.append(box((width, depth, 0.04), np.array([0, 0, level]), UPRIGHT, wood))
-        size = tuple(float(s) for s in rng.uniform((0.15, 0.1, 0.1), (0.5, 0.3, 0.32)))
+        size = sizes(rng, (0.15, 0.1, 0.1), (0.5, 0.3, 0.32))
         across = rng.uniform(-0.3, 0.3) * width
         parts.append(box(size, np.array([across, 0, level + 0.02 + size[2] / 2]), UPRIGHT, str(rng.choice(names))))
     return moved(tuple(parts), place, turned(rng.uniform(0, 2 * np.pi)))
@@ -117,7 +117,7 @@ def _room_thing(rng: np.random.Generator, low: Float64Array, high: Float64Array,
     material = str(rng.choice(names))
     place = rng.uniform(low, high)
     if kind == 0:  # furniture on the floor
-        size = tuple(float(s) for s in rng.uniform((0.2, 0.2, 0.2), (1.2, 1.0, 1.3)))
+        size = sizes(rng, (0.2, 0.2, 0.2), (1.2, 1.0, 1.3))
         place[2] = low[2] + size[2] / 2
         return (box(size, place, turned(rng.uniform(0, np.pi)), material),)
     if kind == 1:  # a pole from floor to ceiling, or a barrel
@@ -157,7 +157,7 @@ def room(
     low = low - np.array([*rng.uniform(0.9, 3.2, 2), 0.0])
     high = high + np.array([*rng.uniform(0.9, 3.2, 2), rng.uniform(0.7, 2.0)])
     low[2] = 0.0
-    high = np.maximum(high, low + (5.0, 5.0, 2.6))
+    high = np.maximum(high, low + np.array([5.0, 5.0, 2.6]))
     wall_materials, solids = _walls(rng, low, high)
     area = float(np.prod((high - low)[:2]))
     count = int(min(rng.uniform(0.6, 1.5) * area, 110))
@@ -181,19 +181,19 @@ def _outdoor_thing(rng: np.random.Generator, centre: Float64Array, names: list[s
     place = np.array([centre[0] + distance * np.cos(bearing), centre[1] + distance * np.sin(bearing), 0.0])
     rotation, material = turned(rng.uniform(0, 2 * np.pi)), str(rng.choice(names))
     if distance > 12 and rng.random() < 0.5:
-        size = tuple(float(s) for s in rng.uniform((4, 4, 3), (12, 9, 12)))
-        return (box(size, place + (0, 0, size[2] / 2), rotation, "facade"),)
+        size = sizes(rng, (4, 4, 3), (12, 9, 12))
+        return (box(size, raised(place, size[2] / 2), rotation, "facade"),)
     kind = rng.choice(4, p=(0.3, 0.3, 0.15, 0.25))
     if kind == 0:
         return moved(tree(rng, material, names), place, rotation)
     if kind == 1:
-        size = tuple(float(s) for s in rng.uniform((0.3, 0.3, 0.3), (2.0, 1.6, 2.2)))
-        return (box(size, place + (0, 0, size[2] / 2), rotation, material),)
+        size = sizes(rng, (0.3, 0.3, 0.3), (2.0, 1.6, 2.2))
+        return (box(size, raised(place, size[2] / 2), rotation, material),)
     if kind == 2:
         half = rng.uniform(1.2, 3.5)
-        return (Solid("cylinder", (float(rng.uniform(0.04, 0.2)), half, 0.0), place + (0, 0, half), UPRIGHT, material),)
+        return (Solid("cylinder", (float(rng.uniform(0.04, 0.2)), half, 0.0), raised(place, half), UPRIGHT, material),)
     extent = rng.uniform(0.4, 1.8)
-    return moved(compound(rng, extent, names), place + (0, 0, extent * 0.4 + rng.choice((0.0, 1.0))), rotation)
+    return moved(compound(rng, extent, names), raised(place, extent * 0.4 + rng.choice((0.0, 1.0))), rotation)
 
 
 def open_air(
