@@ -143,6 +143,18 @@ def test_interrupt_keeps_what_is_done(ask: Ask, pair: PairFolder, monkeypatch: p
     assert (run["reused"], run["counts"]["ok"]) == (2, 3)
 
 
+def test_a_full_disk_is_an_error_that_says_how_to_go_on(
+    ask: Ask, pair: PairFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("viflow_anomaly.batch_files.Journal.append", full)
+    answer = ask(["batch", str(pair.folder)])
+    assert answer.is_refusal("No space left on device; what is done is kept in")
+    assert "--resume" in answer.err
+
+
 # --- bad input
 
 

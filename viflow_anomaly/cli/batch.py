@@ -116,8 +116,16 @@ def _run(recording: Recording, detector: PairDetector, options: BatchOptions, re
         try:
             return run_batch(recording, detector, options, on_progress=show, settings=recorded)
         except KeyboardInterrupt:
-            print(f"interrupted: what is done is kept in {options.out_dir}; go on with --resume", file=sys.stderr)
+            print(f"interrupted: {_kept(options)}", file=sys.stderr)
             raise
+        except OSError as err:
+            if not (options.out_dir / "run.json").is_file():
+                raise
+            raise OSError(err.errno, f"{err.strerror}; {_kept(options)}", err.filename) from err
+
+
+def _kept(options: BatchOptions) -> str:
+    return f"what is done is kept in {options.out_dir}; go on with --resume"
 
 
 def _report(summary: BatchSummary, *, as_json: bool) -> None:
