@@ -90,8 +90,9 @@ def _add_camera(spec: Any, camera: PinholeCamera) -> None:
         resolution=[camera.width, camera.height],
         sensor_size=[camera.width, camera.height],
         focal_pixel=[camera.fx, camera.fy],
-        # Offsets from the middle of the image; integer pixel centres put that at (size - 1) / 2. Signs are tested.
-        principal_pixel=[camera.cx - (camera.width - 1) / 2, camera.cy - (camera.height - 1) / 2],
+        # MuJoCo's offset is that of the image's middle from the principal point (tests/simulator/test_rendering.py);
+        # with integer pixel centres the middle is at (size - 1) / 2.
+        principal_pixel=[(camera.width - 1) / 2 - camera.cx, (camera.height - 1) / 2 - camera.cy],
     )
 
 

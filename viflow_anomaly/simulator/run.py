@@ -17,7 +17,7 @@ from viflow_anomaly.simulator.config import SimulatorConfig
 from viflow_anomaly.simulator.gl import load_mujoco
 from viflow_anomaly.simulator.sequence import write_sequence
 
-WORLD_VERSION = 1  # raised whenever the same seed gives other bytes
+WORLD_VERSION = 2  # raised whenever the same seed gives other bytes
 
 
 def simulate(
