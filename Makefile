@@ -37,7 +37,7 @@ $(VENV)/.torch: constraints.txt
 	  if $$name -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; then python=$$name; break; fi; \
 	done; \
 	[[ -n "$$python" ]] || { echo "error: expected Python 3.11 or later as python3.11 or python3; name another one with: make PYTHON=/path/to/python3" >&2; exit 1; }; \
-	[[ -x $(BIN)/python ]] || "$$python" -m venv $(VENV)
+	[[ -x $(BIN)/python ]] || "$$python" -m venv $(VENV) || { rm -rf $(VENV); exit 1; }
 	@index=; \
 	if [[ "$$(uname -s)" == Linux ]] && $(BIN)/python -c "import urllib.request as u; u.urlopen('$(TORCH_CPU_INDEX)/torch/', timeout=5)" 2>/dev/null; \
 	then index="--extra-index-url $(TORCH_CPU_INDEX)"; fi; \
