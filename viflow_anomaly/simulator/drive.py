@@ -19,7 +19,7 @@ def drive(
 
     The IMU follows the road's curve; the camera is ``camera_above_imu_m`` above it and 1.2 to 1.8 m above the ground.
     """
-    speed = rng.uniform(3.0, 16.0)
+    speed = 3.0 + 13.0 * rng.random() ** 1.3  # m/s, a little more often slow than fast
     gentle = Harmonics.random(rng, frequencies_hz=(0.03, 0.2), count=4)
     largest = max(float(np.abs(gentle.at(times_s, 1)).max()), 1e-9)
     strongest = max(float(np.abs(gentle.at(times_s, 2)).max()), 1e-9)
