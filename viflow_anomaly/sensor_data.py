@@ -22,6 +22,10 @@ Uint8Array = NDArray[np.uint8]
 DistortionModel = Literal["none", "radtan", "equidistant"]
 DISTORTION_COEFF_COUNTS: dict[str, tuple[int, ...]] = {"none": (0,), "radtan": (4, 5), "equidistant": (4,)}
 MIN_IMAGE_SIDE_PX = 32
+# Far beyond any real calibration; what is farther only overflows the arithmetic that follows.
+MAX_CAMERA_NUMBER = {"fx": 1e6, "fy": 1e6, "cx": 1e6, "cy": 1e6, "time_offset_s": 3600.0, "distortion_coeffs": 1e6}
+MIN_FOCAL_LENGTH_PX = 1.0
+MAX_IMU_NUMBER = 1e9
 
 
 def _frozen(array: NDArray[Any]) -> NDArray[Any]:
@@ -45,6 +49,12 @@ def _vectors(name: str, values: object, count: int) -> Float64Array:
         raise InvalidInputError(
             f"{name}: expected finite numbers, found {array[row].tolist()} in row {row}",
             code="imu_not_finite",
+            field=f"imu.{name}",
+        )
+    if array.size and np.abs(array).max() > MAX_IMU_NUMBER:
+        raise InvalidInputError(
+            f"{name}: expected SI units, found {np.abs(array).max():g}, which no sensor measures",
+            code="imu_out_of_range",
             field=f"imu.{name}",
         )
     return _frozen(array.astype(np.float64))
@@ -80,8 +90,8 @@ class ImuSamples:
             gyro-only sensors.
 
     Raises:
-        InvalidInputError: ``imu_empty``, ``imu_wrong_shape``, ``imu_not_finite``, ``imu_unsorted``,
-            ``imu_duplicate_timestamps``, ``timestamp_out_of_range``.
+        InvalidInputError: ``imu_empty``, ``imu_wrong_shape``, ``imu_not_finite``, ``imu_out_of_range``,
+            ``imu_unsorted``, ``imu_duplicate_timestamps``, ``timestamp_out_of_range``.
     """
 
     timestamps_ns: Int64Array
@@ -178,8 +188,21 @@ class PinholeCamera:
                 "distortion_coeffs",
                 f"expected {wanted} finite numbers for {self.distortion_model}, found {self.distortion_coeffs}",
             )
+        self._check_plausible()
         if self.T_cam_imu is not None:
             object.__setattr__(self, "T_cam_imu", _rigid_transform(self.T_cam_imu))
+
+    def _check_plausible(self) -> None:
+        for name, limit in MAX_CAMERA_NUMBER.items():
+            values = self.distortion_coeffs if name == "distortion_coeffs" else (getattr(self, name),)
+            if any(abs(value) > limit for value in values):
+                raise self._invalid(name, f"expected at most {limit:g} in size, found {getattr(self, name)}")
+        for name in ("fx", "fy"):
+            if getattr(self, name) < MIN_FOCAL_LENGTH_PX:
+                raise self._invalid(
+                    name,
+                    f"expected a focal length in pixels, at least {MIN_FOCAL_LENGTH_PX:g}, found {getattr(self, name)}",
+                )
 
     @staticmethod
     def _invalid(name: str, problem: str) -> InvalidInputError:
@@ -257,7 +280,7 @@ class FramePair:
 
     Raises:
         InvalidInputError: ``image_sizes_differ``, ``target_not_later``, ``camera_size_mismatch``,
-            ``motor_command_invalid``.
+            ``motor_command_invalid``, ``timestamp_out_of_range`` (with the camera's time offset).
     """
 
     source: Frame
@@ -301,6 +324,14 @@ class FramePair:
                 code="camera_size_mismatch",
                 field="camera",
             )
+        if self.camera is not None:
+            imu_ns = self.target.timestamp_ns + round(self.camera.time_offset_s * 1e9)
+            if imu_ns > np.iinfo(np.int64).max:
+                raise InvalidInputError(
+                    f"camera: expected stamps below 2^63 ns on the IMU's clock too, found {imu_ns} for the target",
+                    code="timestamp_out_of_range",
+                    field="camera.time_offset_s",
+                )
 
     @property
     def interval_ns(self) -> int:

@@ -115,6 +115,12 @@ BAD_IMU = [
     ),
     pytest.param(imu_with(timestamps_ns=[1.5]), 422, "field_invalid", "imu.timestamps_ns.0", id="fractional stamp"),
     pytest.param(
+        imu_with(gyro_rad_s=[[0, 0, -1e300], *GYRO[1:]]), 422, "imu_out_of_range", "imu.gyro_rad_s", id="gyro of 1e300"
+    ),
+    pytest.param(
+        imu_with(accel_m_s2=[[2e9, 0, 0], *GYRO[1:]]), 422, "imu_out_of_range", "imu.accel_m_s2", id="accel of 2e9"
+    ),
+    pytest.param(
         imu_with(timestamps_ns=[2**63]), 422, "timestamp_out_of_range", "imu.timestamps_ns.0", id="stamp of 64 bits"
     ),
     pytest.param(
@@ -142,6 +148,27 @@ BAD_REST = [
         {"camera": camera_part() | {"T_cam_imu": [[1, 0, 0]]}}, "camera_invalid", "camera.T_cam_imu", id="not 4x4"
     ),
     pytest.param({"camera": "pinhole"}, "field_invalid", "camera", id="camera as text"),
+    *(
+        pytest.param(
+            {"camera": camera_part() | {name: value}}, "camera_invalid", f"camera.{name}", id=f"{name} of {value}"
+        )
+        for name, value in [
+            ("fx", 2e6),
+            ("fx", 0.5),
+            ("fy", 2e6),
+            ("fy", 0.5),
+            ("cx", -2e6),
+            ("cy", 2e6),
+            ("time_offset_s", -4000),
+            ("time_offset_s", 1e300),
+        ]
+    ),
+    pytest.param(
+        {"camera": camera_part() | {"distortion_model": "radtan", "distortion_coeffs": [0, 0, 0, -1e7]}},
+        "camera_invalid",
+        "camera.distortion_coeffs",
+        id="distortion beyond any lens",
+    ),
     pytest.param({"motor_command": [0.5]}, "motor_command_unsupported", "motor_command", id="motor command"),
     pytest.param({"motor_command": []}, "motor_command_invalid", "motor_command", id="empty motor command"),
     pytest.param({"motor_command": [float("nan")]}, "motor_command_invalid", "motor_command", id="NaN motor command"),
@@ -231,6 +258,12 @@ def test_images_of_different_sizes(server: LiveServer) -> None:
 def test_stamps_in_form(server: LiveServer, source_ns: int, target_ns: int, code: str, place: str) -> None:
     imu = imu_part() | {"source_timestamp_ns": source_ns, "target_timestamp_ns": target_ns}
     assert_problem(server.post_form(form_request(imu=("", json.dumps(imu)))), 422, code, place)
+
+
+def test_stamps_that_the_time_offset_carries_out_of_range(server: LiveServer) -> None:
+    request = json_request(camera=camera_part() | {"time_offset_s": 1})
+    request["target"]["timestamp_ns"] = 2**63 - 10
+    assert_problem(server.post_json(request), 422, "timestamp_out_of_range", "camera.time_offset_s")
 
 
 def test_form_without_stamps(server: LiveServer) -> None:
