@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from viflow_anomaly.errors import DatasetError
+from viflow_anomaly.errors import DatasetError, InvalidInputError
 from viflow_anomaly.geometry import rigid_motion_flow
 from viflow_anomaly.sensor_data import Float64Array, PinholeCamera, Uint8Array
 
@@ -178,11 +178,12 @@ class SimulatedGroundTruth:
             fx, fy, cx, cy = (float(value) for value in sensor["intrinsics"])
             width, height = (int(value) for value in sensor["resolution"])
             T_body_cam = np.array(sensor["T_BS"]["data"], dtype=np.float64).reshape(4, 4)
-        except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError) as err:
+            camera = PinholeCamera(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+        except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, InvalidInputError) as err:
             raise DatasetError(
                 f"{path}: expected intrinsics, resolution and T_BS, found {err!r}", code="ground_truth_malformed"
             ) from err
-        return PinholeCamera(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height), T_body_cam
+        return camera, T_body_cam
 
     @cached_property
     def _states(self) -> tuple[NDArray[np.int64], Float64Array]:
@@ -288,5 +289,7 @@ def _csv_rows(path: Path) -> list[tuple[int, list[str]]]:
     try:
         with path.open(newline="", encoding="utf-8") as file:
             return [(number, row) for number, row in enumerate(csv.reader(file), start=1) if number > 1 and row]
-    except (OSError, UnicodeDecodeError) as err:
+    except OSError as err:
         raise DatasetError(f"{path}: expected a CSV file, cannot read it: {err}", code="ground_truth_missing") from err
+    except (UnicodeDecodeError, csv.Error) as err:
+        raise DatasetError(f"{path}: expected a CSV file, found {err}", code="ground_truth_malformed") from err

@@ -6,6 +6,7 @@ drawn again elsewhere.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -135,9 +136,8 @@ def _room_thing(rng: np.random.Generator, low: Float64Array, high: Float64Array,
     return moved(compound(rng, rng.uniform(0.2, 1.1), names), place, turned(rng.uniform(0, 2 * np.pi)))
 
 
-def _fill(keep_clear: KeepClear, count: int, draw: object) -> list[Solid]:
+def _fill(keep_clear: KeepClear, count: int, draw: Callable[[], tuple[Solid, ...]]) -> list[Solid]:
     """``count`` things from ``draw()``, each redrawn up to TRIES times until it stands clear."""
-    assert callable(draw)
     solids: list[Solid] = []
     for _ in range(count):
         for _ in range(TRIES):

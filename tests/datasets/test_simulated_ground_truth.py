@@ -1,0 +1,241 @@
+"""Ground-truth files: round trips, what does not fit, and malformed ones. Needs no simulator."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from viflow_anomaly.datasets.simulated_ground_truth import (
+    OBJECT_COLUMNS,
+    MovingObject,
+    SimulatedGroundTruth,
+    read_depth_png,
+    read_flow_png,
+    write_depth_png,
+    write_flow_png,
+    write_instances_png,
+)
+from viflow_anomaly.errors import DatasetError
+
+STAMPS = (1_000_000_000, 1_050_000_000, 1_100_000_000)
+SENSOR_YAML = """
+T_BS:
+  cols: 4
+  rows: 4
+  data: [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+resolution: [40, 32]
+intrinsics: [50.0, 50.0, 20.0, 16.0]
+"""
+
+
+def make_truth(folder: Path) -> Path:
+    """A wall 4 m ahead; the camera moves 0.1 m to the right every frame; one mover in the first frame."""
+    truth = folder / "mav0" / "groundtruth0"
+    for name in ("depth", "static_flow", "flow", "instances"):
+        (truth / name).mkdir(parents=True)
+    shift = np.zeros((32, 40, 2), np.float32)
+    shift[..., 0] = -50.0 * 0.1 / 4.0
+    instances = np.zeros((32, 40), np.uint8)
+    instances[4:9, 5:11] = 1
+    for index, stamp in enumerate(STAMPS):
+        write_depth_png(truth / f"depth/{stamp}.png", np.full((32, 40), 4.0, np.float32))
+        write_instances_png(truth / f"instances/{stamp}.png", instances)
+        if index < 2:
+            for name in ("static_flow", "flow"):
+                write_flow_png(truth / f"{name}/{stamp}.png", shift, np.ones((32, 40), bool))
+    (truth / "objects.csv").write_text(f"{','.join(OBJECT_COLUMNS)}\n{STAMPS[0]},1,30,5,4,10,8,1.5\n")
+    for name, text in (
+        ("cam0/sensor.yaml", SENSOR_YAML),
+        (
+            "state_groundtruth_estimate0/data.csv",
+            "#timestamp,p,q\n" + "".join(f"{stamp},{0.1 * k},0,0,1,0,0,0\n" for k, stamp in enumerate(STAMPS)),
+        ),
+    ):
+        (folder / "mav0" / name).parent.mkdir()
+        (folder / "mav0" / name).write_text(text)
+    return folder
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return make_truth(tmp_path / "sequence")
+
+
+def test_flow_round_trip_is_exact_to_a_128th(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    flow = rng.uniform(-500, 500, (20, 30, 2)).astype(np.float32)
+    valid = rng.random((20, 30)) < 0.8
+    write_flow_png(tmp_path / "flow.png", flow, valid)
+    again, valid_again = read_flow_png(tmp_path / "flow.png")
+    np.testing.assert_array_equal(valid_again, valid)
+    assert np.abs(again - flow)[valid].max() <= 1 / 128 + 1e-4
+    assert not again[~valid].any()
+    assert again.dtype == np.float32
+
+
+def test_flow_png_is_laid_out_as_kitti(tmp_path: Path) -> None:
+    flow = np.zeros((4, 4, 2), np.float32)
+    flow[1, 2] = (3.0, -2.0)
+    write_flow_png(tmp_path / "flow.png", flow, np.ones((4, 4), bool))
+    stored = cv2.imread(str(tmp_path / "flow.png"), cv2.IMREAD_UNCHANGED)
+    assert stored is not None
+    assert stored.dtype == np.uint16
+    assert stored[1, 2].tolist() == [1, 2**15 - 128, 2**15 + 192]  # OpenCV's order: B valid, G v, R u
+    assert list(tmp_path.iterdir()) == [tmp_path / "flow.png"]
+
+
+@pytest.mark.parametrize("value", [512.0, -512.1, np.nan, np.inf])
+@pytest.mark.parametrize("channel", [0, 1])
+def test_flow_that_does_not_fit_is_invalid(tmp_path: Path, value: float, channel: int) -> None:
+    flow = np.zeros((4, 4, 2), np.float32)
+    flow[1, 2, channel] = value
+    write_flow_png(tmp_path / "flow.png", flow, np.ones((4, 4), bool))
+    again, valid = read_flow_png(tmp_path / "flow.png")
+    assert not valid[1, 2]
+    assert valid.sum() == 15
+    assert not again.any()
+
+
+def test_depth_round_trip(tmp_path: Path) -> None:
+    depth = np.array([[0.5, 1.2345, 255.9], [np.inf, 300.0, np.nan]], np.float32)
+    write_depth_png(tmp_path / "depth.png", depth)
+    again = read_depth_png(tmp_path / "depth.png")
+    np.testing.assert_allclose(again[0], depth[0], atol=1 / 512)
+    assert np.isinf(again[1]).all()
+    assert again.dtype == np.float32
+
+
+@pytest.mark.parametrize("content", [b"", b"not a png", b"\x89PNG\r\n\x1a\n"])
+@pytest.mark.parametrize("read", [read_flow_png, read_depth_png])
+def test_malformed_pngs_are_named(tmp_path: Path, content: bytes, read: object) -> None:
+    assert callable(read)
+    path = tmp_path / "broken.png"
+    path.write_bytes(content)
+    with pytest.raises(DatasetError, match=r"broken\.png") as raised:
+        read(path)
+    assert raised.value.code == "ground_truth_malformed"
+
+
+def test_pngs_of_the_wrong_kind_are_named(tmp_path: Path, root: Path) -> None:
+    write_depth_png(tmp_path / "depth.png", np.ones((4, 4), np.float32))
+    with pytest.raises(DatasetError, match="3 channel") as channels:
+        read_flow_png(tmp_path / "depth.png")
+    assert channels.value.code == "ground_truth_malformed"
+    cv2.imwrite(str(tmp_path / "gray.png"), np.ones((4, 4), np.uint8))
+    with pytest.raises(DatasetError, match="found 1 of uint8") as depths:
+        read_depth_png(tmp_path / "gray.png")
+    assert depths.value.code == "ground_truth_malformed"
+
+
+def test_missing_pngs_are_named(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="cannot read it") as raised:
+        read_flow_png(tmp_path / "none.png")
+    assert raised.value.code == "ground_truth_missing"
+
+
+def test_found_at_root_and_mav0_and_nowhere_else(root: Path, tmp_path: Path) -> None:
+    for place in (root, root / "mav0"):
+        truth = SimulatedGroundTruth.find(place)
+        assert truth is not None
+        assert truth.folder == root / "mav0" / "groundtruth0"
+    assert SimulatedGroundTruth.find(tmp_path) is None
+    with pytest.raises(DatasetError, match="groundtruth0") as raised:
+        SimulatedGroundTruth(tmp_path)
+    assert raised.value.code == "ground_truth_missing"
+
+
+def test_static_flow_of_neighbours_is_the_stored_one(root: Path) -> None:
+    flow, valid = SimulatedGroundTruth(root).static_flow(STAMPS[0], STAMPS[1])
+    np.testing.assert_allclose(flow[..., 0], -1.25)
+    assert valid.all()
+
+
+@pytest.mark.parametrize(("source", "target", "expected"), [(0, 2, -2.5), (1, 0, 1.25), (2, 0, 2.5), (1, 1, 0.0)])
+def test_static_flow_of_any_two_frames_comes_from_depth_and_poses(
+    root: Path, source: int, target: int, expected: float
+) -> None:
+    flow, valid = SimulatedGroundTruth(root).static_flow(STAMPS[source], STAMPS[target])
+    np.testing.assert_allclose(flow[..., 0], expected, atol=1e-4)
+    np.testing.assert_allclose(flow[..., 1], 0.0, atol=1e-4)
+    assert valid.all()
+
+
+def test_static_flow_without_its_png_comes_from_depth(root: Path) -> None:
+    (root / f"mav0/groundtruth0/static_flow/{STAMPS[0]}.png").unlink()
+    flow, _ = SimulatedGroundTruth(root).static_flow(STAMPS[0], STAMPS[1])
+    np.testing.assert_allclose(flow[..., 0], -1.25, atol=1e-4)
+
+
+def test_flow_instances_and_objects(root: Path) -> None:
+    truth = SimulatedGroundTruth(root)
+    assert truth.flow(STAMPS[0])[0].shape == (32, 40, 2)
+    assert truth.instances(STAMPS[0]).sum() == 30
+    assert truth.objects(STAMPS[0]) == [MovingObject(STAMPS[0], 1, 30, 5, 4, 10, 8, 1.5)]
+    assert truth.objects(STAMPS[2]) == []
+
+
+@pytest.mark.parametrize("stamp", [STAMPS[0] - 1, STAMPS[0] + 1, STAMPS[2] + 1])
+def test_unknown_stamps_are_named(root: Path, stamp: int) -> None:
+    with pytest.raises(DatasetError, match=str(stamp)) as raised:
+        SimulatedGroundTruth(root).camera_pose(stamp)
+    assert raised.value.code == "ground_truth_missing"
+
+
+@pytest.mark.parametrize("line", ["1,2,3", "x,0,0,0,1,0,0,0", "1,0,0,a,1,0,0,0"])
+def test_malformed_states_are_named_with_their_line(root: Path, line: str) -> None:
+    (root / "mav0/state_groundtruth_estimate0/data.csv").write_text(f"#header\n{line}\n")
+    with pytest.raises(DatasetError, match="line 2") as raised:
+        SimulatedGroundTruth(root).camera_pose(STAMPS[0])
+    assert raised.value.code == "ground_truth_malformed"
+
+
+@pytest.mark.parametrize("line", ["1,2,3", f"{STAMPS[0]},one,30,5,4,10,8,1.5", f"{STAMPS[0]},1,30,5,4,10,8,much"])
+def test_malformed_objects_are_named_with_their_line(root: Path, line: str) -> None:
+    (root / "mav0/groundtruth0/objects.csv").write_text(f"header\n{line}\n")
+    with pytest.raises(DatasetError, match=r"objects\.csv, line 2") as raised:
+        SimulatedGroundTruth(root).objects(STAMPS[0])
+    assert raised.value.code == "ground_truth_malformed"
+
+
+@pytest.mark.parametrize("content", [b"header\n\xff\xfe\n", b'header\n"' + b"x" * 200_000])
+def test_objects_that_are_no_csv_are_named(root: Path, content: bytes) -> None:
+    (root / "mav0/groundtruth0/objects.csv").write_bytes(content)
+    with pytest.raises(DatasetError, match=r"objects\.csv: expected a CSV") as raised:
+        SimulatedGroundTruth(root).objects(STAMPS[0])
+    assert raised.value.code == "ground_truth_malformed"
+
+
+def test_missing_objects_file_is_named(root: Path) -> None:
+    (root / "mav0/groundtruth0/objects.csv").unlink()
+    with pytest.raises(DatasetError, match=r"objects\.csv") as raised:
+        SimulatedGroundTruth(root).objects(STAMPS[0])
+    assert raised.value.code == "ground_truth_missing"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        None,
+        "a: [",
+        "resolution: [4, 4]",
+        SENSOR_YAML.replace("[40, 32]", "[40]"),
+        SENSOR_YAML.replace("50.0, 50.0,", "fifty, 50.0,"),
+        SENSOR_YAML.replace("data: [1.0,", "data: ["),
+        "just text",
+        SENSOR_YAML.replace("50.0, 50.0,", "-50.0, 50.0,"),
+    ],
+)
+def test_unusable_calibration_is_named(root: Path, text: str | None) -> None:
+    path = root / "mav0/cam0/sensor.yaml"
+    path.unlink() if text is None else path.write_text(text)
+    with pytest.raises(DatasetError, match=r"sensor\.yaml") as raised:
+        _ = SimulatedGroundTruth(root).camera
+    assert raised.value.code == "ground_truth_malformed"
+
+
+def test_camera_of_the_sequence(root: Path) -> None:
+    camera = SimulatedGroundTruth(root).camera
+    assert (camera.fx, camera.cx, camera.width, camera.height) == (50.0, 20.0, 40, 32)
