@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -176,7 +177,10 @@ def _write_truth(truth: Path, world: World, renderer: SceneRenderer, frame: int,
     source, target = world.camera_poses[frame], world.camera_poses[frame + 1]
     flows = flow_truth(world.rig.camera, depth, instances, world.scene.movers, frame, source, target)
     write_flow_png(truth / "static_flow" / f"{stamp}.png", flows.static_flow, flows.static_valid)
-    write_flow_png(truth / "flow" / f"{stamp}.png", flows.flow, flows.valid)
+    if instances.any():
+        write_flow_png(truth / "flow" / f"{stamp}.png", flows.flow, flows.valid)
+    else:  # equal without movers, and encoding is what takes the time
+        shutil.copyfile(truth / "static_flow" / f"{stamp}.png", truth / "flow" / f"{stamp}.png")
     return [
         f"{stamp},{thing.instance_id},{thing.area_px},{thing.u_min},{thing.v_min},{thing.u_max},{thing.v_max},"
         f"{thing.independent_flow_px:.4f}"
