@@ -1,0 +1,85 @@
+"""The only numpy -> torch step: prepared pairs become one batch. Training, command line and service share it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from viflow_anomaly.config import ModelConfig
+from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.motion_input import MotionWindow, build_motion_window
+from viflow_anomaly.sensor_data import FramePair, Uint8Array
+from viflow_anomaly.view import InternalView, make_view
+
+
+@dataclass(frozen=True, eq=False)
+class ModelInput:
+    """One pair as a network wants it, still numpy.
+
+    Attributes:
+        source, target: [h, w] uint8 views.
+        window: its ``values`` are [T, 6].
+        view: how the views came from the source image.
+    """
+
+    source: Uint8Array
+    target: Uint8Array
+    window: MotionWindow
+    view: InternalView
+
+
+class Batch(NamedTuple):
+    """Tensors on one device: source and target [B, 1, H, W] in 0..1, motion [B, T, 6] in rad/s and m/s^2,
+    interval_s [B]."""
+
+    source: torch.Tensor
+    target: torch.Tensor
+    motion: torch.Tensor
+    interval_s: torch.Tensor
+
+
+def prepare(pair: FramePair, config: ModelConfig) -> ModelInput:
+    """Render the views of a pair and build its motion window.
+
+    Raises:
+        InvalidInputError: as ``make_view`` and ``build_motion_window``.
+    """
+    height, width = pair.source.image.shape
+    view = make_view(config.view, width=width, height=height, camera=pair.camera)
+    window = build_motion_window(pair, config.motion_window)
+    return ModelInput(view.render(pair.source.image), view.render(pair.target.image), window, view)
+
+
+def collate(inputs: Sequence[ModelInput], device: torch.device | str = "cpu") -> Batch:
+    """Inputs of one size -> a batch on ``device``."""
+    return collate_arrays(
+        np.stack([one.source for one in inputs]),
+        np.stack([one.target for one in inputs]),
+        np.stack([one.window.values for one in inputs]),
+        np.array([one.window.interval_s for one in inputs], dtype=np.float32),
+        device,
+    )
+
+
+def collate_arrays(
+    source: Uint8Array,
+    target: Uint8Array,
+    motion: Float32Array,
+    interval_s: Float32Array,
+    device: torch.device | str = "cpu",
+) -> Batch:
+    """source, target [B, H, W] uint8, motion [B, T, 6], interval_s [B] -> a batch on ``device``."""
+
+    def images(array: Uint8Array) -> torch.Tensor:
+        return torch.from_numpy(array).to(device).unsqueeze(1).float().div_(255.0)
+
+    return Batch(
+        source=images(source),
+        target=images(target),
+        motion=torch.from_numpy(motion).to(device),
+        interval_s=torch.from_numpy(interval_s).to(device),
+    )

@@ -1,0 +1,42 @@
+"""Where numbers meet classes: a ModelConfig becomes a network."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from viflow_anomaly.config import ModelConfig
+from viflow_anomaly.errors import ConfigError
+from viflow_anomaly.model.compact import CompactViflow
+from viflow_anomaly.model.paper import PaperViflow
+
+
+def build_model(config: ModelConfig, *, seed: int = 0) -> nn.Module:
+    """A freshly initialised network; the same seed gives the same weights and leaves the global generator alone.
+
+    Raises:
+        ConfigError: ``config_invalid``: the paper preset with a view or window that its fixed sizes cannot take.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        if config.preset == "compact":
+            return CompactViflow(
+                motion_rows=config.motion_window.rows,
+                hypotheses=config.hypotheses,
+                focal_px=config.view.focal_px,
+            )
+        return _build_paper(config)
+
+
+def _build_paper(config: ModelConfig) -> nn.Module:
+    side = config.view.crop_size
+    if config.view.mode != "center_crop" or side % 32:
+        raise ConfigError(
+            "the paper preset needs view.mode 'center_crop' with a crop_size that is a multiple of 32, "
+            f"found {config.view.mode!r} of {side}",
+            code="config_invalid",
+            field="view",
+        )
+    return PaperViflow(
+        motion_rows=config.motion_window.rows, hypotheses=config.hypotheses, image_size=(side, side)
+    )
