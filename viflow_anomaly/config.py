@@ -140,6 +140,8 @@ class TrainingConfig(FrozenConfig):
     validate_every: PositiveInt = 1000
     checkpoint_every: PositiveInt = 500
     threads: PositiveInt = 1
+    autocast: bool = Field(default=False, description="bfloat16 in the network; on CUDA and recent CPUs")
+    validation_pairs: PositiveInt = Field(default=64, description="measured at every validation, evenly spread")
 
     @model_validator(mode="after")
     def _look_aheads_in_range(self) -> Self:

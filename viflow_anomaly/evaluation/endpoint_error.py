@@ -1,0 +1,125 @@
+"""Endpoint error of predicted flow against ground truth, beside the identity's (no motion at all).
+
+Measured in source-image pixels over every pixel with ground truth, on the hypothesis that reconstructs the source
+best (the choice needs no ground truth).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from viflow_anomaly.batch import collate, prepare
+from viflow_anomaly.config import ModelConfig
+from viflow_anomaly.datasets.pairing import RecordingPairs
+from viflow_anomaly.datasets.registry import open_recording
+from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
+from viflow_anomaly.errors import DatasetError
+from viflow_anomaly.geometry import Float32Array, pixel_grid
+from viflow_anomaly.losses import select_hypothesis
+from viflow_anomaly.sensor_data import FramePair
+
+
+@dataclass(frozen=True)
+class PairError:
+    """One pair: mean endpoint errors in pixels of the prediction and of the identity, and the winning hypothesis."""
+
+    sequence: str
+    source_timestamp_ns: int
+    epe_px: float
+    identity_epe_px: float
+    hypothesis: int
+
+
+@dataclass(frozen=True)
+class EndpointErrors:
+    """Errors of many pairs."""
+
+    pairs: tuple[PairError, ...] = field(default=())
+
+    def summary(self) -> dict[str, float]:
+        """Means over pairs, and their ratio."""
+        epe = float(np.mean([pair.epe_px for pair in self.pairs]))
+        identity = float(np.mean([pair.identity_epe_px for pair in self.pairs]))
+        ratio = epe / identity if identity else float("nan")
+        return {"epe_px": round(epe, 4), "identity_epe_px": round(identity, 4), "epe_ratio": round(ratio, 4)}
+
+    def per_sequence(self) -> dict[str, dict[str, float]]:
+        """``summary`` of each sequence."""
+        names = sorted({pair.sequence for pair in self.pairs})
+        return {name: EndpointErrors(tuple(p for p in self.pairs if p.sequence == name)).summary() for name in names}
+
+
+def predict_flow(network: nn.Module, config: ModelConfig, pair: FramePair, *, device: str) -> tuple[Float32Array, int]:
+    """The winning hypothesis as flow [H, W, 2] in source pixels, and its index."""
+    prepared = prepare(pair, config)
+    batch = collate([prepared], device)
+    with torch.inference_mode():
+        output = network(batch.source, batch.motion, batch.interval_s)
+        winner = int(select_hypothesis(output, batch.source, batch.target)[0])
+        flow = output.flow_px[0, winner].permute(1, 2, 0).float().cpu().contiguous().numpy()
+    height, width = pair.source.image.shape
+    return prepared.view.target_coordinates(flow, output.stride) - pixel_grid(height, width), winner
+
+
+def measure_endpoint_errors(
+    network: nn.Module,
+    config: ModelConfig,
+    recordings: Sequence[Path],
+    *,
+    max_pairs: int | None = None,
+    device: str = "cpu",
+) -> EndpointErrors:
+    """Errors against simulated static flow, adjacent frames.
+
+    Args:
+        network: in evaluation mode.
+        recordings: simulated sequences with ground truth.
+        max_pairs: evenly spread over all pairs (None: all).
+
+    Raises:
+        DatasetError: ``ground_truth_missing`` for a recording without ground truth.
+    """
+    opened: list[tuple[RecordingPairs, SimulatedGroundTruth, int]] = []
+    for path in recordings:
+        recording = open_recording(path)
+        truth = SimulatedGroundTruth.find(recording.root)
+        if truth is None:
+            raise DatasetError(
+                f"{path}: expected a simulated recording with ground truth (groundtruth0), found none",
+                code="ground_truth_missing",
+                field="validation",
+            )
+        pairs = RecordingPairs(recording)
+        opened += [(pairs, truth, index) for index in range(len(pairs))]
+    if max_pairs is not None and len(opened) > max_pairs:
+        opened = [opened[k] for k in np.linspace(0, len(opened) - 1, max_pairs).round().astype(int)]
+    return EndpointErrors(tuple(_pair_error(network, config, *one, device=device) for one in opened))
+
+
+def _pair_error(
+    network: nn.Module,
+    config: ModelConfig,
+    pairs: RecordingPairs,
+    truth: SimulatedGroundTruth,
+    index: int,
+    *,
+    device: str,
+) -> PairError:
+    pair = pairs[index]
+    predicted, winner = predict_flow(network, config, pair, device=device)
+    flow, valid = truth.static_flow(pair.source.timestamp_ns, pair.target.timestamp_ns)
+    difference: Any = np.linalg.norm(predicted - flow, axis=-1)[valid]
+    return PairError(
+        sequence=pairs.recording.name,
+        source_timestamp_ns=pair.source.timestamp_ns,
+        epe_px=float(difference.mean()),
+        identity_epe_px=float(np.linalg.norm(flow, axis=-1)[valid].mean()),
+        hypothesis=winner,
+    )

@@ -1,0 +1,157 @@
+"""Bilinear warping and the unsupervised losses: photometric error of each hypothesis, winner takes all [Approach]."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import torch
+import torch.nn.functional as F  # noqa: N812  # torch's own convention
+
+from viflow_anomaly.model.outputs import ViflowOutput
+
+CHARBONNIER_EPSILON = 0.01
+"""In the normalised intensities of ``photometric_loss``, about one gray level."""
+
+
+class LossResult(NamedTuple):
+    """loss: scalar; winners: [B] index of the hypothesis that reconstructed each example best."""
+
+    loss: torch.Tensor
+    winners: torch.Tensor
+
+
+def warp(image: torch.Tensor, flow_px: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Sample ``image`` at each pixel plus flow, bilinearly; pixel centres lie at integer coordinates.
+
+    Args:
+        image: [B, C, H, W].
+        flow_px: [B, 2, H, W] (du, dv) in pixels.
+
+    Returns:
+        sampled [B, C, H, W] (border repeated) and inside [B, 1, H, W] bool.
+    """
+    height, width = image.shape[-2:]
+    x = torch.arange(width, device=image.device, dtype=flow_px.dtype) + flow_px[:, 0]
+    y = torch.arange(height, device=image.device, dtype=flow_px.dtype)[:, None] + flow_px[:, 1]
+    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    grid = torch.stack([2 * x / (width - 1) - 1, 2 * y / (height - 1) - 1], dim=-1)
+    sampled = F.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)
+    return sampled, inside.unsqueeze(1)
+
+
+def winner_take_all(errors: torch.Tensor, *, relaxation: float = 0.0) -> LossResult:
+    """The least error of each example, averaged; only its hypothesis receives gradient.
+
+    Args:
+        errors: [B, K].
+        relaxation: weight of the mean over all hypotheses, which keeps losers alive (0: the paper's loss).
+    """
+    best, winners = errors.min(dim=1)
+    loss = best.mean()
+    if relaxation:
+        loss = (1 - relaxation) * loss + relaxation * errors.mean()
+    return LossResult(loss, winners)
+
+
+def squared_error_loss(output: ViflowOutput, source: torch.Tensor, target: torch.Tensor) -> LossResult:
+    """The paper's loss: squared Euclidean error of each reconstruction, winner takes all.
+
+    Args:
+        output: full-resolution hypotheses (stride 1).
+        source, target: [B, 1, H, W] in 0..1.
+    """
+    flow = output.flow_px
+    hypotheses = flow.shape[1]
+    errors = []
+    for k in range(hypotheses):
+        reconstruction, _ = warp(target, flow[:, k])
+        errors.append((reconstruction - source).square().sum(dim=(1, 2, 3)))
+    return winner_take_all(torch.stack(errors, dim=1))
+
+
+def photometric_loss(
+    output: ViflowOutput, source: torch.Tensor, target: torch.Tensor, *, relaxation: float
+) -> LossResult:
+    """Charbonnier error over a pyramid, winner takes all with a relaxation.
+
+    All hypotheses compete on the flow's own grid and at half of it; the winner alone is also judged at twice the
+    grid's resolution. Images are normalised to mean 0 and deviation 1, so that a change of exposure costs nothing.
+
+    Args:
+        output: hypotheses of an even stride S.
+        source, target: [B, 1, H, W], H and W multiples of 2 S.
+        relaxation: weight of the mean over all hypotheses.
+    """
+    flow, stride = output
+    batch, hypotheses, _, rows, columns = flow.shape
+    source, target = _normalised(source), _normalised(target)
+    errors = flow.new_zeros(batch, hypotheses)
+    for shrink, weight in ((stride * 2, 0.5), (stride, 1.0)):
+        level_flow = flow.flatten(0, 1) / shrink
+        if shrink != stride:
+            level_flow = F.avg_pool2d(level_flow, shrink // stride)
+        level_source = F.avg_pool2d(source, shrink).repeat_interleave(hypotheses, dim=0)
+        level_target = F.avg_pool2d(target, shrink).repeat_interleave(hypotheses, dim=0)
+        errors = errors + weight * _charbonnier(level_source, level_target, level_flow).unflatten(0, (batch, -1))
+    _, winners = errors.min(dim=1)
+    winning = flow[torch.arange(batch, device=flow.device), winners]
+    fine = stride // 2
+    fine_flow = F.interpolate(winning, scale_factor=2.0, mode="bilinear", align_corners=False) / fine
+    fine_error = _charbonnier(F.avg_pool2d(source, fine), F.avg_pool2d(target, fine), fine_flow)
+    coarse = winner_take_all(errors, relaxation=relaxation)
+    return LossResult(coarse.loss + fine_error.mean(), winners)
+
+
+def select_hypothesis(output: ViflowOutput, source: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """The hypothesis whose reconstruction fits best, judged as in training on a coarse grid: [B] int64.
+
+    Args:
+        output: [B, K, 2, h, w] hypotheses.
+        source, target: [B, 1, H, W] in 0..1.
+    """
+    flow, stride = output
+    batch, hypotheses, _, _, _ = flow.shape
+    if hypotheses == 1:
+        return torch.zeros(batch, dtype=torch.int64, device=flow.device)
+    shrink = max(stride, 4)
+    height, width = (side // shrink * shrink for side in source.shape[-2:])
+    level_flow = flow.flatten(0, 1) / shrink
+    if shrink != stride:
+        level_flow = F.avg_pool2d(level_flow, shrink // stride)
+    level_flow = level_flow[..., : height // shrink, : width // shrink]
+    level_source = F.avg_pool2d(_normalised(source[..., :height, :width]), shrink)
+    level_target = F.avg_pool2d(_normalised(target[..., :height, :width]), shrink)
+    errors = _charbonnier(
+        level_source.repeat_interleave(hypotheses, dim=0),
+        level_target.repeat_interleave(hypotheses, dim=0),
+        level_flow,
+    )
+    return errors.unflatten(0, (batch, -1)).argmin(dim=1)
+
+
+def reconstruction_loss(
+    kind: Literal["squared", "charbonnier"],
+    output: ViflowOutput,
+    source: torch.Tensor,
+    target: torch.Tensor,
+    *,
+    relaxation: float,
+) -> LossResult:
+    """The loss a ``TrainingConfig`` names."""
+    if kind == "squared" or output.stride == 1:
+        return squared_error_loss(output, source, target)
+    return photometric_loss(output, source, target, relaxation=relaxation)
+
+
+def _normalised(image: torch.Tensor) -> torch.Tensor:
+    mean = image.mean(dim=(1, 2, 3), keepdim=True)
+    deviation = image.std(dim=(1, 2, 3), keepdim=True)
+    return (image - mean) / (deviation + 0.02)
+
+
+def _charbonnier(source: torch.Tensor, target: torch.Tensor, flow_px: torch.Tensor) -> torch.Tensor:
+    """Mean error [N] over the pixels whose prediction stays inside the target."""
+    reconstruction, inside = warp(target, flow_px)
+    error = torch.sqrt((reconstruction - source).square() + CHARBONNIER_EPSILON**2)
+    weight = inside.to(error.dtype)
+    return (error * weight).sum(dim=(1, 2, 3)) / weight.sum(dim=(1, 2, 3)).clamp_min(1.0)

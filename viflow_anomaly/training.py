@@ -1,0 +1,219 @@
+"""Unsupervised training: the reconstruction of the source image is the teacher; hypotheses compete for each example.
+
+A step's data are a pure function of (seed, step), and the state on disk is exact, so that a killed and resumed run
+gives the weights of an uninterrupted one (on a CPU, with the same number of threads).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from viflow_anomaly import __version__
+from viflow_anomaly.checkpoint import (
+    load_training_state,
+    save_checkpoint,
+    save_training_state,
+    source_commit,
+)
+from viflow_anomaly.config import ModelConfig, TrainingConfig
+from viflow_anomaly.errors import ConfigError
+from viflow_anomaly.evaluation.endpoint_error import EndpointErrors, measure_endpoint_errors
+from viflow_anomaly.losses import reconstruction_loss
+from viflow_anomaly.model.builder import build_model
+from viflow_anomaly.training_data import TrainingData, load_training_data
+from viflow_anomaly.training_progress import TrainingProgress
+
+Metrics = dict[str, float]
+
+
+class TrainingRun:
+    """Network, optimiser and step counter of one run, and their exact way to disk and back."""
+
+    def __init__(self, *, model: ModelConfig, training: TrainingConfig, device: str) -> None:
+        self.model_config = model
+        self.config = training
+        self.device = device
+        self.network = build_model(model, seed=training.seed).to(device).to(memory_format=torch.channels_last)
+        self.optimizer = torch.optim.AdamW(
+            self.network.parameters(), lr=training.learning_rate, weight_decay=training.weight_decay
+        )
+        self.step = 0
+
+    def train_step(self, data: TrainingData) -> tuple[float, torch.Tensor]:
+        """One optimiser step; the loss and the wins of each hypothesis [K]."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(self.config, self.step)
+        batch = data.sample(
+            seed=self.config.seed, step=self.step, batch_size=self.config.batch_size, device=self.device
+        )
+        source = batch.source.contiguous(memory_format=torch.channels_last)
+        with torch.autocast(torch.device(self.device).type, dtype=torch.bfloat16, enabled=self.config.autocast):
+            output = self.network(source, batch.motion, batch.interval_s)
+        output = output._replace(flow_px=output.flow_px.float())
+        loss, winners = reconstruction_loss(
+            self.config.loss, output, batch.source, batch.target, relaxation=self.config.relaxation
+        )
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
+        self.optimizer.step()
+        self.step += 1
+        return float(loss.detach()), torch.bincount(winners, minlength=self.model_config.hypotheses)
+
+    def save(self, folder: Path, fingerprint: Mapping[str, Any]) -> None:
+        """Write the whole state atomically."""
+        tensors = {f"model.{key}": value for key, value in self.network.state_dict().items()}
+        for index, state in self.optimizer.state_dict()["state"].items():
+            tensors |= {f"optimizer.{index}.{key}": torch.as_tensor(value) for key, value in state.items()}
+        save_training_state(folder, tensors, {"step": self.step, **fingerprint})
+
+    def restore(self, folder: Path, fingerprint: Mapping[str, Any]) -> bool:
+        """Take up the state in ``folder``; False where there is none.
+
+        Raises:
+            ConfigError: ``resume_config_differs``.
+            CheckpointError: ``checkpoint_corrupt``.
+        """
+        loaded = load_training_state(folder)
+        if loaded is None:
+            return False
+        tensors, record = loaded
+        for key, value in fingerprint.items():
+            if record.get(key) != json.loads(json.dumps(value)):
+                raise ConfigError(
+                    f"{folder}: --resume expects the {key} that the run was started with, {record.get(key)}, "
+                    f"found {value}",
+                    code="resume_config_differs",
+                    field=key,
+                )
+        self.network.load_state_dict(_below(tensors, "model."))
+        states: dict[int, dict[str, torch.Tensor]] = {}
+        for key, value in _below(tensors, "optimizer.").items():
+            index, name = key.split(".", 1)
+            states.setdefault(int(index), {})[name] = value
+        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": states})
+        self.step = int(record["step"])
+        return True
+
+
+def _below(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+
+
+def learning_rate(config: TrainingConfig, step: int) -> float:
+    """Linear warm-up, then half a cosine down to a hundredth."""
+    if step < config.warmup_steps:
+        return config.learning_rate * (step + 1) / config.warmup_steps
+    progress = (step - config.warmup_steps) / max(1, config.steps - config.warmup_steps)
+    return config.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(1.0, progress))))
+
+
+def train(
+    data: Sequence[Path],
+    out_dir: Path,
+    *,
+    model: ModelConfig,
+    training: TrainingConfig,
+    validation: Sequence[Path] = (),
+    device: str = "cpu",
+    resume: bool = False,
+    progress: bool = True,
+) -> Path:
+    """Train on recordings of any known layout.
+
+    Args:
+        data: recordings to learn from.
+        out_dir: gets ``state.safetensors`` (exact, for resuming), ``model.safetensors`` + ``model.json``,
+            ``metrics.jsonl`` and TensorBoard's ``events.*``.
+        validation: recordings with ground truth to measure on, never to learn from.
+        resume: go on from ``out_dir``; a fresh directory starts anew.
+
+    Returns:
+        The path of the finished ``model.safetensors``.
+
+    Raises:
+        ConfigError: ``training_exists``, ``resume_config_differs``, ``device_unavailable``.
+        DatasetError: as ``load_training_data``.
+    """
+    _check_device(device)
+    torch.set_num_threads(training.threads)
+    run = TrainingRun(model=model, training=training, device=device)
+    fingerprint = {"model": model.model_dump(mode="json"), "training": training.model_dump(mode="json")}
+    if resume:
+        run.restore(out_dir, fingerprint)
+    elif (out_dir / "state.safetensors").exists():
+        raise ConfigError(
+            f"{out_dir}: expected a directory without a training run, found one; --resume goes on with it",
+            code="training_exists",
+            field="out",
+        )
+    with TrainingProgress(out_dir, steps=training.steps, first_step=run.step, visible=progress) as reporter:
+        training_data = load_training_data(data, model, training.look_aheads, on_progress=reporter.loading)
+        metrics = _run_steps(run, training_data, validation, out_dir, fingerprint, reporter)
+    provenance = {
+        "package_version": __version__,
+        "commit": source_commit(),
+        "torch_version": torch.__version__,
+        "device": device,
+        "training": fingerprint["training"],
+        "data": {
+            "recordings": len(data),
+            "names": sorted(path.name for path in data),
+            "pairs": training_data.pair_count,
+            "excluded": training_data.excluded,
+        },
+        "metrics": metrics,
+    }
+    name = f"viflow-{model.preset}"
+    path = out_dir / "model.safetensors"
+    return save_checkpoint(path, run.network, model, name=name, version=__version__, provenance=provenance)
+
+
+def _run_steps(
+    run: TrainingRun,
+    data: TrainingData,
+    validation: Sequence[Path],
+    out_dir: Path,
+    fingerprint: Mapping[str, Any],
+    reporter: TrainingProgress,
+) -> Metrics:
+    config = run.config
+    metrics: Metrics = {}
+    run.network.train()
+    while run.step < config.steps:
+        loss, wins = run.train_step(data)
+        reporter.stepped(run.step, loss, wins.tolist())
+        last = run.step == config.steps
+        if validation and (last or run.step % config.validate_every == 0):
+            metrics = _validate(run, validation)
+            reporter.validated(run.step, metrics)
+        if last or run.step % config.checkpoint_every == 0:
+            run.save(out_dir, fingerprint)
+    if not metrics and validation:
+        metrics = _validate(run, validation)
+    return metrics
+
+
+def _validate(run: TrainingRun, validation: Sequence[Path]) -> Metrics:
+    run.network.eval()
+    errors: EndpointErrors = measure_endpoint_errors(
+        run.network, run.model_config, validation, max_pairs=run.config.validation_pairs, device=run.device
+    )
+    run.network.train()
+    return errors.summary()
+
+
+def _check_device(device: str) -> None:
+    if torch.device(device).type == "cuda" and not torch.cuda.is_available():
+        raise ConfigError(
+            f"device: expected one that this machine has, found {device!r} and no CUDA device",
+            code="device_unavailable",
+            field="device",
+        )

@@ -1,0 +1,157 @@
+"""Recordings in memory, ready for training: every frame rendered once to its view, every pair with its window."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viflow_anomaly.batch import Batch, collate_arrays
+from viflow_anomaly.config import ModelConfig
+from viflow_anomaly.datasets.pairing import RecordingPairs
+from viflow_anomaly.datasets.registry import open_recording
+from viflow_anomaly.errors import DatasetError, InvalidInputError
+from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.motion_input import MotionWindow, build_motion_window
+from viflow_anomaly.sensor_data import Frame, FramePair, Uint8Array
+from viflow_anomaly.view import make_view
+
+
+@dataclass(frozen=True, eq=False)
+class PairBucket:
+    """All pairs whose views have one size.
+
+    Attributes:
+        frames: [N, h, w] uint8 views.
+        pairs: [P, 2] indices into ``frames`` (source, target).
+        motion: [P, T, 6] windows.
+        interval_s: [P].
+        mirrorable: [P] the window is in camera axes, so that a mirrored pair has a known motion.
+    """
+
+    frames: Uint8Array
+    pairs: NDArray[np.int64]
+    motion: Float32Array
+    interval_s: Float32Array
+    mirrorable: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingData:
+    """Buckets, how many pairs they hold, and why others were left out (fault code -> count)."""
+
+    buckets: tuple[PairBucket, ...]
+    excluded: dict[str, int]
+
+    @property
+    def pair_count(self) -> int:
+        return sum(len(bucket.pairs) for bucket in self.buckets)
+
+    def sample(self, *, seed: int, step: int, batch_size: int, device: str) -> Batch:
+        """The batch of one step: a pure function of (seed, step), so that a resumed run sees the same data.
+
+        Half of the pairs that may be are mirrored left to right: angular rate is an axial vector (y and z change
+        sign), specific force a polar one (x changes sign).
+        """
+        rng = np.random.default_rng([seed, step])
+        sizes = np.array([len(bucket.pairs) for bucket in self.buckets], dtype=np.float64)
+        bucket = self.buckets[int(rng.choice(len(self.buckets), p=sizes / sizes.sum()))]
+        chosen = rng.integers(len(bucket.pairs), size=batch_size)
+        source, target = (bucket.frames[bucket.pairs[chosen, side]] for side in (0, 1))
+        motion = bucket.motion[chosen].copy()
+        mirrored = (rng.random(batch_size) < 0.5) & bucket.mirrorable[chosen]
+        source[mirrored], target[mirrored] = source[mirrored, :, ::-1], target[mirrored, :, ::-1]
+        motion[mirrored] *= np.array([1, -1, -1, -1, 1, 1], dtype=np.float32)
+        return collate_arrays(source, target, motion, bucket.interval_s[chosen], device)
+
+
+@dataclass(eq=False)
+class _Growing:
+    frames: list[Uint8Array]
+    pairs: list[tuple[int, int]]
+    windows: list[MotionWindow]
+    mirrorable: list[bool]
+
+
+def load_training_data(
+    paths: Sequence[Path],
+    config: ModelConfig,
+    look_aheads: Sequence[int],
+    *,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> TrainingData:
+    """Read recordings of any known layout. A pair that cannot be used is counted, by the code of its fault.
+
+    Raises:
+        DatasetError: as ``open_recording``; ``training_data_empty`` when no pair is left.
+    """
+    buckets: dict[tuple[int, int], _Growing] = defaultdict(lambda: _Growing([], [], [], []))
+    excluded: Counter[str] = Counter()
+    for done, path in enumerate(paths):
+        _add_recording(path, config, look_aheads, buckets, excluded)
+        if on_progress is not None:
+            on_progress(done + 1, len(paths))
+    filled = [buckets[size] for size in sorted(buckets) if buckets[size].pairs]
+    if not filled:
+        raise DatasetError(
+            f"training data: expected at least one usable frame pair in {len(paths)} recordings, found none "
+            f"(left out: {dict(excluded)})",
+            code="training_data_empty",
+            field="data",
+        )
+    return TrainingData(tuple(_finished(bucket) for bucket in filled), dict(excluded))
+
+
+def _add_recording(
+    path: Path,
+    config: ModelConfig,
+    look_aheads: Sequence[int],
+    buckets: dict[tuple[int, int], _Growing],
+    excluded: Counter[str],
+) -> None:
+    recording = open_recording(path)
+    pairs = RecordingPairs(recording, look_aheads)
+    camera = recording.camera
+    images = [recording.frame(index).image for index in range(len(recording))]
+    height, width = images[0].shape
+    view = make_view(config.view, width=width, height=height, camera=camera)
+    bucket = buckets[view.height, view.width]
+    first = len(bucket.frames)
+    bucket.frames += [view.render(image) for image in images]
+    stamps = recording.frame_timestamps_ns
+    in_camera_axes = config.motion_window.axes == "camera" and camera is not None and camera.T_cam_imu is not None
+    for index, (source, target) in enumerate(pairs.indices):
+        try:
+            window = build_motion_window(
+                FramePair(
+                    source=Frame(int(stamps[source]), images[source]),
+                    target=Frame(int(stamps[target]), images[target]),
+                    imu=pairs.imu(index),
+                    camera=camera,
+                ),
+                config.motion_window,
+            )
+        except InvalidInputError as err:
+            excluded[err.code] += 1
+            continue
+        abstained = next((fault.code for fault in window.faults if fault.severity == "abstain"), None)
+        if abstained is not None:
+            excluded[abstained] += 1
+            continue
+        bucket.pairs.append((first + source, first + target))
+        bucket.windows.append(window)
+        bucket.mirrorable.append(in_camera_axes)
+
+
+def _finished(bucket: _Growing) -> PairBucket:
+    return PairBucket(
+        frames=np.stack(bucket.frames),
+        pairs=np.array(bucket.pairs, dtype=np.int64),
+        motion=np.stack([window.values for window in bucket.windows]),
+        interval_s=np.array([window.interval_s for window in bucket.windows], dtype=np.float32),
+        mirrorable=np.array(bucket.mirrorable, dtype=np.bool_),
+    )
