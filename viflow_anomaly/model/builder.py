@@ -22,6 +22,7 @@ def build_model(config: ModelConfig, *, seed: int = 0) -> nn.Module:
         if config.preset == "compact":
             return CompactViflow(
                 motion_rows=config.motion_window.rows,
+                interval_rows=config.motion_window.samples_between,
                 hypotheses=config.hypotheses,
                 focal_px=config.view.focal_px,
             )
@@ -37,6 +38,4 @@ def _build_paper(config: ModelConfig) -> nn.Module:
             code="config_invalid",
             field="view",
         )
-    return PaperViflow(
-        motion_rows=config.motion_window.rows, hypotheses=config.hypotheses, image_size=(side, side)
-    )
+    return PaperViflow(motion_rows=config.motion_window.rows, hypotheses=config.hypotheses, image_size=(side, side))

@@ -1,7 +1,7 @@
 """The compact preset: VIFlow's parts in a fully convolutional network that trains and runs on a CPU.
 
-Global shifter: motion -> the eight-parameter quadratic motion model (affine plus the two terms that a rotating
-perspective camera adds). Local shifter: encoder and top-down decoder on the source image alone, each scale modulated
+Global shifter: the gyro's rotation between the frames, through a learned 3x3 mounting that starts at the identity,
+moves every ray exactly; the motion code adds an eight-parameter quadratic motion model for each hypothesis. Local shifter: encoder and top-down decoder on the source image alone, each scale modulated
 by the motion code (the paper's fusion, without a fixed image size). Hypotheses differ in both.
 """
 
@@ -75,6 +75,7 @@ class CompactViflow(nn.Module):
 
     Args:
         motion_rows: T of the [T, 6] window.
+        interval_rows: how many of them, at its end, cover the frame interval evenly.
         hypotheses: K.
         focal_px: pixels that the coordinate inputs are divided by (the view's focal length).
         widths: channels at strides 4, 8, 16, 32.
@@ -85,6 +86,7 @@ class CompactViflow(nn.Module):
         self,
         *,
         motion_rows: int,
+        interval_rows: int,
         hypotheses: int,
         focal_px: float,
         widths: tuple[int, int, int, int] = (24, 48, 112, 128),
@@ -93,8 +95,11 @@ class CompactViflow(nn.Module):
     ) -> None:
         super().__init__()
         w4, w8, w16, w32 = widths
+        self.interval_rows = interval_rows
         self.hypotheses = hypotheses
         self.focal_px = focal_px
+        self.mounting = nn.Linear(3, 3, bias=False)
+        nn.init.eye_(self.mounting.weight)
         self.motion_encoder = MotionEncoder(rows=motion_rows, width=motion_width, code_width=code_width)
         self.global_head = nn.Linear(code_width, hypotheses * QUADRATIC_PARAMETERS)
         self.encode4 = _convolution(16 + 2, w4)
@@ -120,7 +125,8 @@ class CompactViflow(nn.Module):
         height, width = source.shape[-2:]
         code = self.motion_encoder(motion, interval_s)
         rays = self._rays(source)
-        flow = (self._global_flow(code, rays) + self._local_flow(source, code, rays)) * self.focal_px
+        turned = self._rotation_flow(motion, interval_s, rays).unsqueeze(1)
+        flow = (turned + self._global_flow(code, rays) + self._local_flow(source, code, rays)) * self.focal_px
         rows, columns = -(-height // FLOW_STRIDE), -(-width // FLOW_STRIDE)
         return ViflowOutput(flow[..., :rows, :columns], stride=FLOW_STRIDE)
 
@@ -133,6 +139,14 @@ class CompactViflow(nn.Module):
         x = torch.arange(cells_w, device=source.device, dtype=source.dtype) * FLOW_STRIDE + half - (width - 1) / 2
         grid = torch.stack([x.expand(cells_h, -1), y[:, None].expand(-1, cells_w)])
         return grid.unsqueeze(0) / self.focal_px
+
+    def _rotation_flow(self, motion: torch.Tensor, interval_s: torch.Tensor, rays: torch.Tensor) -> torch.Tensor:
+        """Flow of a camera that only turns [B, 2, h, w] in focal lengths: X_target = exp(-[theta]x) X_source."""
+        rate = motion[:, -self.interval_rows :, :3].mean(dim=1)
+        theta = self.mounting(rate * interval_s[:, None])
+        rotation = _rotation_matrix(-theta)  # B, 3, 3
+        moved = torch.einsum("bij,jhw->bihw", rotation[:, :, :2], rays[0]) + rotation[:, :, 2, None, None]
+        return moved[:, :2] / moved[:, 2:].clamp_min(0.1) - rays
 
     def _global_flow(self, code: torch.Tensor, rays: torch.Tensor) -> torch.Tensor:
         """Quadratic motion model [B, K, 2, h, w] in focal lengths: affine + (a x + b y) (x, y)."""
@@ -164,7 +178,18 @@ class CompactViflow(nn.Module):
         top = self.decode8(self.modulate8(at8 + _doubled(top), code))
         top = self.modulate4(at4 + _doubled(top), code)
         shifts: torch.Tensor = self.local_head(F.leaky_relu(top, 0.1))
-        return shifts.unflatten(1, (self.hypotheses, 2))
+        return shifts.reshape(batch, self.hypotheses, 2, *shifts.shape[-2:])
+
+
+def _rotation_matrix(theta: torch.Tensor) -> torch.Tensor:
+    """Rodrigues: rotation vectors [B, 3] in rad -> matrices [B, 3, 3]; smooth at zero."""
+    x, y, z = theta.unbind(dim=1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).unflatten(1, (3, 3))
+    angle2 = theta.square().sum(dim=1)[:, None, None] + 1e-12
+    angle = angle2.sqrt()
+    identity = torch.eye(3, device=theta.device, dtype=theta.dtype)
+    return identity + torch.sin(angle) / angle * cross + (1 - torch.cos(angle)) / angle2 * (cross @ cross)
 
 
 def _doubled(features: torch.Tensor) -> torch.Tensor:

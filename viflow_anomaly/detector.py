@@ -1,0 +1,203 @@
+"""The one inference path: FramePair -> Detection. Command line, batch and service all come through here."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import NamedTuple, Self
+
+import numpy as np
+import torch
+from torch import nn
+
+from viflow_anomaly.batch import ModelInput, collate, prepare
+from viflow_anomaly.checkpoint import CheckpointRecord, load_checkpoint
+from viflow_anomaly.config import DetectorConfig
+from viflow_anomaly.detection import (
+    AnalyzedRegion,
+    Detection,
+    ImageSize,
+    ModelInfo,
+    Reason,
+    ResidualSummary,
+    Roi,
+    rois_from_regions,
+)
+from viflow_anomaly.errors import ConfigError
+from viflow_anomaly.geometry import Float32Array, pixel_grid
+from viflow_anomaly.losses import select_hypothesis
+from viflow_anomaly.regions import find_regions
+from viflow_anomaly.residual import photometric_residual, reconstruct
+from viflow_anomaly.sensor_data import FramePair
+
+RESIDUAL_SAMPLE_STRIDE = 3
+"""The residual's summary is taken on every third row and column."""
+NOTHING_IN_COMMON = Reason(
+    code="no_overlap",
+    message="expected the two images to share a part of the scene, found a predicted motion beyond the whole image",
+)
+
+
+class Analysis(NamedTuple):
+    """A detection with the maps it was made from, for pictures and further processing.
+
+    Attributes:
+        detection: what ``detect`` returns.
+        residual: [H, W] float32 photometric residual in gray levels at the source image's size.
+        reconstruction: [H, W] float32 source image rebuilt from the target.
+        flow_px: [H, W, 2] float32 flow of the winning hypothesis in source pixels.
+        hypothesis: its index.
+    """
+
+    detection: Detection
+    residual: Float32Array
+    reconstruction: Float32Array
+    flow_px: Float32Array
+    hypothesis: int
+
+
+class _Prediction(NamedTuple):
+    target_coordinates: Float32Array
+    hypothesis: int
+
+
+class AnomalyDetector:
+    """Finds independent motion. Holds weights and configuration only, so that threads may share it.
+
+    Args:
+        network: in evaluation mode, on ``device``.
+        record: where the network came from and what its input looks like.
+        config: thresholds and shape rule.
+        device: torch device name.
+    """
+
+    def __init__(self, network: nn.Module, record: CheckpointRecord, *, config: DetectorConfig, device: str) -> None:
+        self._network = network
+        self._record = record
+        self.config = config
+        self.device = device
+        self.model_info = ModelInfo(name=record.name, version=record.version, sha256=record.sha256)
+
+    @classmethod
+    def from_checkpoint(
+        cls, path: Path | None = None, *, config: DetectorConfig | None = None, device: str = "cpu"
+    ) -> Self:
+        """Load a checkpoint (None: the bundled model).
+
+        Raises:
+            CheckpointError: as ``load_checkpoint``.
+            ConfigError: ``device_unavailable``.
+        """
+        if torch.device(device).type == "cuda" and not torch.cuda.is_available():
+            raise ConfigError(
+                f"device: expected one that this machine has, found {device!r} and no CUDA device",
+                code="device_unavailable",
+                field="device",
+            )
+        network, record = load_checkpoint(path)
+        network = network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        return cls(network, record, config=config or DetectorConfig(), device=device)
+
+    def with_config(self, config: DetectorConfig) -> AnomalyDetector:
+        """The same weights under another configuration; nothing is loaded or copied."""
+        return AnomalyDetector(self._network, self._record, config=config, device=self.device)
+
+    def detect(self, pair: FramePair, *, decode_ms: float = 0.0) -> Detection:
+        """Judge one pair.
+
+        Raises:
+            InvalidInputError: as ``prepare``: the pair's IMU or image cannot be used at all. A pair that merely
+                cannot be judged gives a detection with status ``abstained``.
+        """
+        return self.analyze(pair, decode_ms=decode_ms).detection
+
+    def analyze(self, pair: FramePair, *, decode_ms: float = 0.0) -> Analysis:
+        """``detect`` with its maps; same errors. The paper's algorithm on one screen."""
+        started = time.perf_counter()
+        model_input = prepare(pair, self._record.model)
+        prediction = self._predict(model_input)
+        reconstruction, inside = reconstruct(pair.target.image, prediction.target_coordinates)
+        if (analyzed := model_input.view.analyzed()) is not None:
+            inside &= analyzed
+        residual = photometric_residual(pair.source.image, reconstruction, inside)
+        inferred = time.perf_counter()
+        summary = _summary(residual, inside)
+        reasons, abstained = self._judge_input(pair, model_input)
+        if summary is None:
+            reasons, abstained = (*reasons, NOTHING_IN_COMMON), True
+        rois: tuple[Roi, ...] = ()
+        if not abstained:
+            image = ImageSize(width=residual.shape[1], height=residual.shape[0])
+            regions = find_regions(residual, inside, self.config.regions).regions
+            rois = rois_from_regions(regions, image, include_masks=self.config.include_masks)
+        finished = time.perf_counter()
+        timings_ms = {
+            "decode": decode_ms,
+            "inference": (inferred - started) * 1e3,
+            "regions": (finished - inferred) * 1e3,
+            "total": decode_ms + (finished - started) * 1e3,
+        }
+        height, width = residual.shape
+        x, y, region_width, region_height = model_input.view.region()
+        detection = Detection(
+            source_timestamp_ns=pair.source.timestamp_ns,
+            target_timestamp_ns=pair.target.timestamp_ns,
+            image=ImageSize(width=width, height=height),
+            status="abstained" if abstained else "ok",
+            reasons=reasons,
+            model=self.model_info,
+            rois=rois,
+            region_analyzed=AnalyzedRegion(x=x, y=y, width=region_width, height=region_height),
+            residual=summary,
+            timings_ms=timings_ms,
+        )
+        flow_px = prediction.target_coordinates - pixel_grid(height, width)
+        return Analysis(detection, residual, reconstruction, flow_px, prediction.hypothesis)
+
+    def _predict(self, model_input: ModelInput) -> _Prediction:
+        """Where each source pixel went, by the hypothesis that reconstructs the source best."""
+        batch = collate([model_input], self.device)
+        autocast = torch.autocast("cuda", dtype=torch.bfloat16, enabled=torch.device(self.device).type == "cuda")
+        with torch.inference_mode(), autocast:
+            source = batch.source.contiguous(memory_format=torch.channels_last)
+            output = self._network(source, batch.motion, batch.interval_s)
+            output = output._replace(flow_px=output.flow_px.float())
+            winner = int(select_hypothesis(output, batch.source, batch.target)[0])
+            flow = output.flow_px[0, winner].permute(1, 2, 0).contiguous().cpu().numpy()
+        return _Prediction(model_input.view.target_coordinates(flow, output.stride), winner)
+
+    def _judge_input(self, pair: FramePair, model_input: ModelInput) -> tuple[tuple[Reason, ...], bool]:
+        """What lowers trust in this pair, and whether it must not be judged."""
+        faults = model_input.window.faults
+        reasons = [Reason(code=fault.code, message=fault.message) for fault in faults]
+        abstained = any(fault.severity == "abstain" for fault in faults)
+        source, target = (image[::4, ::4] for image in (pair.source.image, pair.target.image))
+        texture = min(float(source.std()), float(target.std()))
+        if texture < self.config.min_texture_gray:
+            reasons.append(
+                Reason(
+                    code="no_texture",
+                    message=f"expected a deviation of at least {self.config.min_texture_gray} gray levels in both "
+                    f"images, found {texture:.1f}: a uniform image shows no motion",
+                )
+            )
+            abstained = True
+        jump = abs(float(source.mean()) - float(target.mean()))
+        if jump > self.config.max_exposure_jump_gray:
+            reasons.append(
+                Reason(
+                    code="exposure_jump",
+                    message=f"the mean brightness changed by {jump:.0f} gray levels between the frames, more than "
+                    f"{self.config.max_exposure_jump_gray:.0f}: the residual is not motion alone",
+                )
+            )
+        return tuple(reasons), abstained
+
+
+def _summary(residual: Float32Array, inside: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> ResidualSummary | None:
+    thin = (slice(None, None, RESIDUAL_SAMPLE_STRIDE),) * 2
+    values = residual[thin][inside[thin]]
+    if not values.size:
+        return None
+    median, p95 = np.percentile(values, (50, 95))
+    return ResidualSummary(mean=float(values.mean()), median=float(median), p95=float(p95))
