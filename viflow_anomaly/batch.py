@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from viflow_anomaly.config import ModelConfig
+from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.motion_input import MotionWindow, build_motion_window
 from viflow_anomaly.sensor_data import FramePair, Uint8Array
@@ -40,6 +41,22 @@ class Batch(NamedTuple):
     target: torch.Tensor
     motion: torch.Tensor
     interval_s: torch.Tensor
+
+
+def require_device(device: str) -> None:
+    """Find out whether this machine and this torch can compute on ``device``.
+
+    Raises:
+        ConfigError: ``device_unavailable``.
+    """
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as err:  # a torch without CUDA asserts
+        raise ConfigError(
+            f"device: expected one that this machine has, found {device!r}: {str(err).splitlines()[0]}",
+            code="device_unavailable",
+            field="device",
+        ) from err
 
 
 def prepare(pair: FramePair, config: ModelConfig) -> ModelInput:

@@ -1,4 +1,4 @@
-"""Checkpoints are data: NAME.safetensors (tensors) beside NAME.json (configuration, provenance, checksum). No pickle."""
+"""Checkpoints are data, never pickles: NAME.safetensors (tensors) beside NAME.json (configuration, checksum)."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ class CheckpointRecord(FrozenConfig):
         provenance: commit, training configuration, data, metrics; free-form, for people.
     """
 
-    format_version: Literal[1] = FORMAT_VERSION
+    format_version: Literal[1] = 1
     name: str = Field(min_length=1)
     version: str = Field(min_length=1)
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
     model: ModelConfig
-    provenance: dict[str, Any] = {}
+    provenance: dict[str, Any] = Field(default_factory=dict)
 
 
 class LoadedCheckpoint(NamedTuple):
@@ -113,11 +113,14 @@ def load_checkpoint(path: Path | None = None) -> LoadedCheckpoint:
     found = hashlib.sha256(data).hexdigest()
     if found != record.sha256:
         raise _corrupt(path, f"expected sha256 {record.sha256}, found {found} over {len(data)} bytes")
-    model = build_model(record.model)
+    try:
+        model = build_model(record.model)
+    except ConfigError as err:
+        raise _invalid_record(path.with_suffix(".json"), err.message) from err
     try:
         model.load_state_dict(load_tensors(data))
     except (SafetensorError, RuntimeError) as err:
-        raise _corrupt(path, str(err).splitlines()[0]) from err
+        raise _corrupt(path, f"expected the tensors of the model in its .json, found: {_one_line(err)}") from err
     return LoadedCheckpoint(model.eval(), record)
 
 
@@ -135,12 +138,12 @@ def _read(path: Path) -> bytes:
 def _read_record(path: Path) -> CheckpointRecord:
     record_path = path.with_suffix(".json")
     data = _read(record_path)
+    if len(data) > MAX_RECORD_BYTES:
+        raise _invalid_record(record_path, f"expected at most {MAX_RECORD_BYTES} bytes, found {len(data)}")
     try:
-        values = json.loads(data[: MAX_RECORD_BYTES + 1])
-    except ValueError as err:
-        raise CheckpointError(
-            f"{record_path}: expected JSON, found: {err}", code="checkpoint_record_invalid", field="checkpoint"
-        ) from err
+        values = json.loads(data)
+    except (ValueError, RecursionError) as err:
+        raise _invalid_record(record_path, f"expected JSON, found: {err}") from err
     version = values.get("format_version") if isinstance(values, dict) else None
     if version is not None and version != FORMAT_VERSION:
         raise CheckpointError(
@@ -154,10 +157,16 @@ def _read_record(path: Path) -> CheckpointRecord:
         raise CheckpointError(err.message, code="checkpoint_record_invalid", field="checkpoint") from err
 
 
+def _invalid_record(record_path: Path, problem: str) -> CheckpointError:
+    return CheckpointError(f"{record_path}: {problem}", code="checkpoint_record_invalid", field="checkpoint")
+
+
 def _corrupt(path: Path, problem: str) -> CheckpointError:
-    return CheckpointError(
-        f"{path}: truncated or altered: {problem}", code="checkpoint_corrupt", field="checkpoint"
-    )
+    return CheckpointError(f"{path}: truncated or altered: {problem}", code="checkpoint_corrupt", field="checkpoint")
+
+
+def _one_line(err: Exception) -> str:
+    return " ".join(str(err).split())[:300]
 
 
 def save_training_state(folder: Path, tensors: Mapping[str, torch.Tensor], record: Mapping[str, Any]) -> None:
@@ -180,9 +189,9 @@ def load_training_state(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str
     try:
         tensors = load_tensors(data)
         header_bytes = int.from_bytes(data[:8], "little")
-        record = json.loads(json.loads(data[8 : 8 + header_bytes])["__metadata__"]["record"])
+        record: dict[str, Any] = json.loads(json.loads(data[8 : 8 + header_bytes])["__metadata__"]["record"])
     except (SafetensorError, ValueError, KeyError) as err:
-        raise _corrupt(path, str(err).splitlines()[0]) from err
+        raise _corrupt(path, f"expected tensors and the record of a training, found: {_one_line(err)}") from err
     return tensors, record
 
 

@@ -16,6 +16,7 @@ import torch
 from torch import nn
 
 from viflow_anomaly import __version__
+from viflow_anomaly.batch import require_device
 from viflow_anomaly.checkpoint import (
     load_training_state,
     save_checkpoint,
@@ -23,14 +24,12 @@ from viflow_anomaly.checkpoint import (
     source_commit,
 )
 from viflow_anomaly.config import ModelConfig, TrainingConfig
-from viflow_anomaly.errors import ConfigError
-from viflow_anomaly.evaluation.endpoint_error import EndpointErrors, measure_endpoint_errors
+from viflow_anomaly.errors import CheckpointError, ConfigError
+from viflow_anomaly.evaluation.endpoint_error import EndpointErrors, measure_endpoint_errors, require_ground_truth
 from viflow_anomaly.losses import reconstruction_loss
 from viflow_anomaly.model.builder import build_model
 from viflow_anomaly.training_data import TrainingData, load_training_data
 from viflow_anomaly.training_progress import TrainingProgress
-
-Metrics = dict[str, float]
 
 
 class TrainingRun:
@@ -40,7 +39,8 @@ class TrainingRun:
         self.model_config = model
         self.config = training
         self.device = device
-        self.network = build_model(model, seed=training.seed).to(device).to(memory_format=torch.channels_last)
+        network = build_model(model, seed=training.seed).to(device)
+        self.network: nn.Module = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), lr=training.learning_rate, weight_decay=training.weight_decay
         )
@@ -93,14 +93,28 @@ class TrainingRun:
                     code="resume_config_differs",
                     field=key,
                 )
-        self.network.load_state_dict(_below(tensors, "model."))
-        states: dict[int, dict[str, torch.Tensor]] = {}
-        for key, value in _below(tensors, "optimizer.").items():
-            index, name = key.split(".", 1)
-            states.setdefault(int(index), {})[name] = value
-        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": states})
-        self.step = int(record["step"])
+        try:
+            self.network.load_state_dict(_below(tensors, "model."))
+            self._restore_optimizer(_below(tensors, "optimizer."))
+            self.step = int(record["step"])
+        except (RuntimeError, ValueError, KeyError) as err:
+            raise CheckpointError(
+                f"{folder}: expected the whole state of this training, found: {' '.join(str(err).split())[:300]}",
+                code="checkpoint_corrupt",
+                field="out",
+            ) from err
         return True
+
+    def _restore_optimizer(self, tensors: Mapping[str, torch.Tensor]) -> None:
+        parameters = list(self.network.parameters())
+        states: dict[int, dict[str, torch.Tensor]] = {}
+        for key, value in tensors.items():
+            index, name = key.split(".", 1)
+            # A moment of another memory layout than its parameter's would take another arithmetic path.
+            like = parameters[int(index)]
+            same_layout = torch.empty_like(like).copy_(value) if value.shape == like.shape else value
+            states.setdefault(int(index), {})[name] = same_layout
+        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": states})
 
 
 def _below(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
@@ -140,9 +154,11 @@ def train(
 
     Raises:
         ConfigError: ``training_exists``, ``resume_config_differs``, ``device_unavailable``.
-        DatasetError: as ``load_training_data``.
+        DatasetError: as ``load_training_data`` and, before anything is learnt, ``require_ground_truth``.
+        CheckpointError: ``checkpoint_corrupt`` for the state to go on from.
     """
-    _check_device(device)
+    require_device(device)
+    require_ground_truth(validation)
     torch.set_num_threads(training.threads)
     run = TrainingRun(model=model, training=training, device=device)
     fingerprint = {"model": model.model_dump(mode="json"), "training": training.model_dump(mode="json")}
@@ -156,7 +172,7 @@ def train(
         )
     with TrainingProgress(out_dir, steps=training.steps, first_step=run.step, visible=progress) as reporter:
         training_data = load_training_data(data, model, training.look_aheads, on_progress=reporter.loading)
-        metrics = _run_steps(run, training_data, validation, out_dir, fingerprint, reporter)
+        errors = _run_steps(run, training_data, validation, out_dir, fingerprint, reporter)
     provenance = {
         "package_version": __version__,
         "commit": source_commit(),
@@ -169,7 +185,7 @@ def train(
             "pairs": training_data.pair_count,
             "excluded": training_data.excluded,
         },
-        "metrics": metrics,
+        "metrics": _provenance_metrics(errors),
     }
     name = f"viflow-{model.preset}"
     path = out_dir / "model.safetensors"
@@ -183,37 +199,35 @@ def _run_steps(
     out_dir: Path,
     fingerprint: Mapping[str, Any],
     reporter: TrainingProgress,
-) -> Metrics:
+) -> EndpointErrors | None:
+    """All steps that are left; the endpoint errors after the last one, None without validation recordings."""
     config = run.config
-    metrics: Metrics = {}
+    errors: EndpointErrors | None = None
     run.network.train()
     while run.step < config.steps:
         loss, wins = run.train_step(data)
         reporter.stepped(run.step, loss, wins.tolist())
         last = run.step == config.steps
         if validation and (last or run.step % config.validate_every == 0):
-            metrics = _validate(run, validation)
-            reporter.validated(run.step, metrics)
+            errors = _validate(run, validation)
+            reporter.validated(run.step, errors.summary())
         if last or run.step % config.checkpoint_every == 0:
             run.save(out_dir, fingerprint)
-    if not metrics and validation:
-        metrics = _validate(run, validation)
-    return metrics
+    if errors is None and validation:
+        errors = _validate(run, validation)
+    return errors
 
 
-def _validate(run: TrainingRun, validation: Sequence[Path]) -> Metrics:
+def _provenance_metrics(errors: EndpointErrors | None) -> dict[str, Any]:
+    if errors is None:
+        return {}
+    return {**errors.summary(), "groups": {name: group.summary() for name, group in errors.per_group().items()}}
+
+
+def _validate(run: TrainingRun, validation: Sequence[Path]) -> EndpointErrors:
     run.network.eval()
-    errors: EndpointErrors = measure_endpoint_errors(
+    errors = measure_endpoint_errors(
         run.network, run.model_config, validation, max_pairs=run.config.validation_pairs, device=run.device
     )
     run.network.train()
-    return errors.summary()
-
-
-def _check_device(device: str) -> None:
-    if torch.device(device).type == "cuda" and not torch.cuda.is_available():
-        raise ConfigError(
-            f"device: expected one that this machine has, found {device!r} and no CUDA device",
-            code="device_unavailable",
-            field="device",
-        )
+    return errors

@@ -20,6 +20,9 @@ from viflow_anomaly.motion_input import MotionWindow, build_motion_window
 from viflow_anomaly.sensor_data import Frame, FramePair, Uint8Array
 from viflow_anomaly.view import make_view
 
+MIRRORED_MOTION_SIGNS = (1, -1, -1, -1, 1, 1)
+"""Left and right exchanged: angular rate is an axial vector (y and z change sign), specific force a polar one (x)."""
+
 
 @dataclass(frozen=True, eq=False)
 class PairBucket:
@@ -54,8 +57,7 @@ class TrainingData:
     def sample(self, *, seed: int, step: int, batch_size: int, device: str) -> Batch:
         """The batch of one step: a pure function of (seed, step), so that a resumed run sees the same data.
 
-        Half of the pairs that may be are mirrored left to right: angular rate is an axial vector (y and z change
-        sign), specific force a polar one (x changes sign).
+        Half of the pairs that may be are mirrored left to right, with their motion.
         """
         rng = np.random.default_rng([seed, step])
         sizes = np.array([len(bucket.pairs) for bucket in self.buckets], dtype=np.float64)
@@ -65,7 +67,7 @@ class TrainingData:
         motion = bucket.motion[chosen].copy()
         mirrored = (rng.random(batch_size) < 0.5) & bucket.mirrorable[chosen]
         source[mirrored], target[mirrored] = source[mirrored, :, ::-1], target[mirrored, :, ::-1]
-        motion[mirrored] *= np.array([1, -1, -1, -1, 1, 1], dtype=np.float32)
+        motion[mirrored] *= np.array(MIRRORED_MOTION_SIGNS, dtype=np.float32)
         return collate_arrays(source, target, motion, bucket.interval_s[chosen], device)
 
 

@@ -11,6 +11,8 @@ from typing import Any, Self
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from viflow_anomaly.checkpoint import write_atomically
+
 LOG_EVERY = 50
 
 
@@ -21,6 +23,20 @@ def _summary_writer(folder: Path) -> Any | None:
     except ImportError:
         return None
     return SummaryWriter(str(folder))
+
+
+def _forget_later_steps(path: Path, step: int) -> None:
+    """Drop what a killed run logged after its last saved state (a resumed run logs it again), and a torn line."""
+    if not path.exists():
+        return
+    kept = []
+    for line in path.read_text(encoding="utf-8").splitlines(keepends=True):
+        try:
+            if json.loads(line)["step"] <= step and line.endswith("\n"):
+                kept.append(line)
+        except (ValueError, TypeError, KeyError):
+            continue
+    write_atomically(path, "".join(kept).encode())
 
 
 class TrainingProgress:
@@ -55,7 +71,9 @@ class TrainingProgress:
 
     def __enter__(self) -> Self:
         self._out_dir.mkdir(parents=True, exist_ok=True)
-        self._metrics = (self._out_dir / "metrics.jsonl").open("a", encoding="utf-8")
+        path = self._out_dir / "metrics.jsonl"
+        _forget_later_steps(path, self._first_step)
+        self._metrics = path.open("a", encoding="utf-8")
         self._writer = _summary_writer(self._out_dir)
         self._bar.start()
         return self

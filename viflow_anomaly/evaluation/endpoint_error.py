@@ -6,7 +6,7 @@ best (the choice needs no ground truth).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -50,10 +50,17 @@ class EndpointErrors:
         ratio = epe / identity if identity else float("nan")
         return {"epe_px": round(epe, 4), "identity_epe_px": round(identity, 4), "epe_ratio": round(ratio, 4)}
 
-    def per_sequence(self) -> dict[str, dict[str, float]]:
-        """``summary`` of each sequence."""
-        names = sorted({pair.sequence for pair in self.pairs})
-        return {name: EndpointErrors(tuple(p for p in self.pairs if p.sequence == name)).summary() for name in names}
+    def per_sequence(self) -> dict[str, EndpointErrors]:
+        """The errors of each sequence, by its name."""
+        return self._split(lambda pair: pair.sequence)
+
+    def per_group(self) -> dict[str, EndpointErrors]:
+        """The errors of each group of sequences: the name up to its first underscore (the simulator's rig)."""
+        return self._split(lambda pair: pair.sequence.split("_", 1)[0])
+
+    def _split(self, key: Callable[[PairError], str]) -> dict[str, EndpointErrors]:
+        names = sorted({key(pair) for pair in self.pairs})
+        return {name: EndpointErrors(tuple(pair for pair in self.pairs if key(pair) == name)) for name in names}
 
 
 def predict_flow(network: nn.Module, config: ModelConfig, pair: FramePair, *, device: str) -> tuple[Float32Array, int]:
@@ -75,6 +82,7 @@ def measure_endpoint_errors(
     *,
     max_pairs: int | None = None,
     device: str = "cpu",
+    on_progress: Callable[[int, int], None] | None = None,
 ) -> EndpointErrors:
     """Errors against simulated static flow, adjacent frames.
 
@@ -82,25 +90,49 @@ def measure_endpoint_errors(
         network: in evaluation mode.
         recordings: simulated sequences with ground truth.
         max_pairs: evenly spread over all pairs (None: all).
+        on_progress: called with (done, total) after each pair.
 
     Raises:
-        DatasetError: ``ground_truth_missing`` for a recording without ground truth.
+        DatasetError: ``ground_truth_missing`` for a recording without ground truth, or with none that is valid for a
+            pair; ``ground_truth_malformed``; as ``open_recording``.
     """
     opened: list[tuple[RecordingPairs, SimulatedGroundTruth, int]] = []
     for path in recordings:
-        recording = open_recording(path)
-        truth = SimulatedGroundTruth.find(recording.root)
-        if truth is None:
-            raise DatasetError(
-                f"{path}: expected a simulated recording with ground truth (groundtruth0), found none",
-                code="ground_truth_missing",
-                field="validation",
-            )
-        pairs = RecordingPairs(recording)
+        pairs, truth = _open_with_ground_truth(path)
         opened += [(pairs, truth, index) for index in range(len(pairs))]
     if max_pairs is not None and len(opened) > max_pairs:
         opened = [opened[k] for k in np.linspace(0, len(opened) - 1, max_pairs).round().astype(int)]
-    return EndpointErrors(tuple(_pair_error(network, config, *one, device=device) for one in opened))
+    errors = []
+    for done, one in enumerate(opened, start=1):
+        errors.append(_pair_error(network, config, *one, device=device))
+        if on_progress is not None:
+            on_progress(done, len(opened))
+    return EndpointErrors(tuple(errors))
+
+
+def require_ground_truth(recordings: Sequence[Path]) -> None:
+    """Find out before a long training, not after it, that a recording cannot be measured on.
+
+    Raises:
+        DatasetError: as ``measure_endpoint_errors``; only the ground truth of the first pair is read.
+    """
+    for path in recordings:
+        pairs, truth = _open_with_ground_truth(path)
+        truth.static_flow(*pairs.stamps(0))
+
+
+def _open_with_ground_truth(path: Path) -> tuple[RecordingPairs, SimulatedGroundTruth]:
+    recording = open_recording(path)
+    truth = SimulatedGroundTruth.find(recording.root)
+    pairs = RecordingPairs(recording)
+    if truth is None or not pairs:
+        found = "none" if truth is None else f"{len(recording)} frame"
+        raise DatasetError(
+            f"{path}: expected a simulated recording with ground truth (groundtruth0) and two frames, found {found}",
+            code="ground_truth_missing",
+            field="validation",
+        )
+    return pairs, truth
 
 
 def _pair_error(
@@ -115,6 +147,12 @@ def _pair_error(
     pair = pairs[index]
     predicted, winner = predict_flow(network, config, pair, device=device)
     flow, valid = truth.static_flow(pair.source.timestamp_ns, pair.target.timestamp_ns)
+    if not valid.any():
+        raise DatasetError(
+            f"{truth.folder}: expected valid static flow at {pair.source.timestamp_ns}, found no valid pixel",
+            code="ground_truth_missing",
+            field="validation",
+        )
     difference: Any = np.linalg.norm(predicted - flow, axis=-1)[valid]
     return PairError(
         sequence=pairs.recording.name,

@@ -1,0 +1,153 @@
+"""``viflow-anomaly evaluate``: a model against ground truth."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from viflow_anomaly.cli.options import (
+    AsJson,
+    Assignments,
+    Checkpoint,
+    ConfigFile,
+    Device,
+    Threads,
+    limit_threads,
+    settings_from,
+)
+from viflow_anomaly.cli.progress import stderr_progress
+
+if TYPE_CHECKING:
+    from viflow_anomaly.checkpoint import CheckpointRecord
+    from viflow_anomaly.evaluation.endpoint_error import EndpointErrors
+
+
+def flow(
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="DIR...", help="Simulated recordings with ground truth, one a folder.")
+    ],
+    as_json: AsJson = False,
+    max_pairs: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Measure N pairs, evenly spread (default: all).")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write the JSON into this file.")] = None,
+    checkpoint: Checkpoint = None,
+    threads: Threads = None,
+    device: Device = None,
+    config: ConfigFile = None,
+    assignments: Assignments = None,
+) -> None:
+    """Measure the endpoint error of the predicted flow, beside that of predicting no motion at all.
+
+    Errors are means over pairs, in pixels of the source image, on the static world. A sequence belongs to the group
+    that its name gives up to the first underscore (`drone_000007`: drone).
+
+    [bold]Examples[/bold]
+
+      viflow-anomaly evaluate flow runs/held-out/*
+
+      viflow-anomaly evaluate flow runs/held-out/* --checkpoint runs/first/model.safetensors --json --out flow.json
+    """
+    options = {"checkpoint": checkpoint, "threads": threads, "device": device}
+    settings = settings_from(config, assignments, options)
+    limit_threads(settings.threads)
+    from viflow_anomaly.batch import require_device
+    from viflow_anomaly.checkpoint import load_checkpoint, write_atomically
+    from viflow_anomaly.evaluation.endpoint_error import measure_endpoint_errors, require_ground_truth
+
+    require_device(settings.device)
+    model, record = load_checkpoint(settings.checkpoint)
+    require_ground_truth(recordings)
+    with stderr_progress() as progress:
+        task = progress.add_task("pairs", total=None)
+        errors = measure_endpoint_errors(
+            model.to(settings.device),
+            record.model,
+            recordings,
+            max_pairs=max_pairs,
+            device=settings.device,
+            on_progress=lambda done, total: progress.update(task, completed=done, total=total),
+        )
+    text = json.dumps(_report(errors, record), indent=2, ensure_ascii=False, allow_nan=False)
+    if out is not None:
+        write_atomically(out, (text + "\n").encode())
+    print(text) if as_json else _print_table(errors, record)
+
+
+def _report(errors: EndpointErrors, record: CheckpointRecord) -> dict[str, Any]:
+    from viflow_anomaly.checkpoint import source_commit
+
+    return {
+        "model": {"name": record.name, "version": record.version, "sha256": record.sha256},
+        "commit": source_commit(),
+        "machine": {"cpu": _cpu_model(), "cores": os.cpu_count()},
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "all": _measures(errors),
+        "groups": {name: _measures(group) for name, group in errors.per_group().items()},
+        "sequences": {name: _measures(sequence) for name, sequence in errors.per_sequence().items()},
+    }
+
+
+def _measures(errors: EndpointErrors) -> dict[str, float | int | None]:
+    """The summary with the number of pairs; the ratio to an identity error of 0 is null."""
+    summary = errors.summary()
+    ratio = summary["epe_ratio"]
+    return {**summary, "epe_ratio": None if math.isnan(ratio) else ratio, "pairs": len(errors.pairs)}
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return named[0] if named else platform.processor() or platform.machine()
+
+
+def _print_table(errors: EndpointErrors, record: CheckpointRecord) -> None:
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Column, Table
+
+    columns = [Column(name, justify="right") for name in ("pairs", "EPE px", "identity EPE px", "ratio")]
+    table = Table(Column("sequence", no_wrap=True), *columns, box=SIMPLE)
+    parts = [errors.per_sequence(), errors.per_group(), {"all": errors}]
+    for part in parts:
+        for name, some in part.items():
+            measures = some.summary()
+            numbers = (f"{measures[key]:.3f}" for key in ("epe_px", "identity_epe_px", "epe_ratio"))
+            table.add_row(escape(name), str(len(some.pairs)), *numbers)
+        table.add_section()
+    console = Console()
+    console.print(f"model {escape(record.name)} {escape(record.version)}", highlight=False)
+    console.print(table)
+
+
+def register(app: typer.Typer) -> None:
+    evaluate = typer.Typer(
+        name="evaluate",
+        no_args_is_help=True,
+        help="""Measure a model against ground truth.
+
+    [bold]Examples[/bold]
+
+      viflow-anomaly evaluate flow runs/held-out/*
+
+      viflow-anomaly evaluate flow runs/held-out/* --json
+    """,
+    )
+    evaluate.callback()(_only_subcommands)
+    evaluate.command(no_args_is_help=True)(flow)
+    app.add_typer(evaluate)
+
+
+def _only_subcommands() -> None:
+    """A callback keeps ``flow`` a subcommand while it is the only one."""
