@@ -1,6 +1,6 @@
 # make demo   a virtual environment of its own, then the main job on the bundled model and the bundled sample
 # make test   the gate: lint, format, strict types, import direction, tests with a branch-coverage floor
-# Others: lint, model, wheel, clean, distclean. Needs Python >= 3.11, make and git; fetches from package indexes only.
+# Others: lint, model (simulate, train, measure), evaluate, wheel, clean, distclean. Needs Python >= 3.11, make and git; fetches from package indexes only.
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
@@ -19,17 +19,18 @@ DEMO_SAMPLE ?= samples/drone
 DEMO_OUT ?= demo-output
 COVERAGE_FLOOR ?= 90
 
-# The recipe of the bundled model. Held-out seeds are never trained on.
+# The recipe of the bundled model: seeds, sizes and steps. Held-out seeds are never trained on.
 MODEL_DIR ?= runs/model
-MODEL_TRAIN_SEED ?= 1000
-MODEL_HELD_OUT_SEED ?= 900000
-MODEL_DRONE_SEQUENCES ?= 60
-MODEL_CAR_SEQUENCES ?= 40
-MODEL_FRAMES ?= 60
-MODEL_STEPS ?= 20000
-MODEL_JOBS ?= 1
+MODEL_SEQUENCES ?= 360
+MODEL_FRAMES ?= 32
+MODEL_STEPS ?= 4800
+MODEL_JOBS ?= 2
+MODEL_THREADS ?= 2
+MODEL_TRAINING := --set training.learning_rate=0.0015 --set training.warmup_steps=200
+HELD_OUT_SEQUENCES ?= 12
+HELD_OUT_FRAMES ?= 20
 
-.PHONY: demo test lint model wheel clean distclean
+.PHONY: demo test lint model held-out evaluate wheel clean distclean
 
 $(VENV)/.torch: constraints.txt
 	@echo 'making $(VENV) with torch (once, some minutes)'
@@ -72,14 +73,26 @@ wheel: $(VENV)/.installed
 	$(PIP) wheel --quiet --no-deps --wheel-dir dist .
 	$(BIN)/python .ci/check_wheel.py dist/*.whl
 
-model: $(VENV)/.installed-dev
-	for rig in drone:$(MODEL_DRONE_SEQUENCES) car:$(MODEL_CAR_SEQUENCES); do \
-	  common="--rig $${rig%:*} --frames $(MODEL_FRAMES) --jobs $(MODEL_JOBS)"; \
-	  $(BIN)/viflow-anomaly simulate $$common --sequences $${rig#*:} --seed $(MODEL_TRAIN_SEED) --out $(MODEL_DIR)/train; \
-	  $(BIN)/viflow-anomaly simulate $$common --sequences 4 --seed $(MODEL_HELD_OUT_SEED) --out $(MODEL_DIR)/held-out; \
+model: held-out
+	for rig in drone:10000 car:50000; do \
+	  $(BIN)/viflow-anomaly simulate --rig $${rig%:*} --seed $${rig#*:} --sequences $(MODEL_SEQUENCES) \
+	    --frames $(MODEL_FRAMES) --jobs $(MODEL_JOBS) --out $(MODEL_DIR)/train --set simulator.ground_truth=false >/dev/null; \
 	done
-	validation=; for folder in $(MODEL_DIR)/held-out/*/; do validation+=" --validation $$folder"; done; \
-	$(BIN)/viflow-anomaly train $(MODEL_DIR)/train/*/ $$validation --out $(MODEL_DIR)/run --steps $(MODEL_STEPS) --resume
+	validation=; for folder in $(MODEL_DIR)/held-out/*_9?000[0-5]; do validation+=" --validation $$folder"; done; \
+	$(BIN)/viflow-anomaly train $(MODEL_DIR)/train/* $$validation --out $(MODEL_DIR)/run --resume \
+	  --steps $(MODEL_STEPS) --threads $(MODEL_THREADS) $(MODEL_TRAINING)
+	cp $(MODEL_DIR)/run/model.safetensors viflow_anomaly/weights/viflow-compact.safetensors
+	cp $(MODEL_DIR)/run/model.json viflow_anomaly/weights/viflow-compact.json
+	$(MAKE) --no-print-directory evaluate
+
+held-out: $(VENV)/.installed-dev
+	for rig in drone:900000 car:950000; do \
+	  $(BIN)/viflow-anomaly simulate --rig $${rig%:*} --seed $${rig#*:} --sequences $(HELD_OUT_SEQUENCES) \
+	    --frames $(HELD_OUT_FRAMES) --jobs $(MODEL_JOBS) --out $(MODEL_DIR)/held-out >/dev/null; \
+	done
+
+evaluate: held-out
+	$(BIN)/viflow-anomaly evaluate flow $(MODEL_DIR)/held-out/* --out benchmarks/results/endpoint-error.json
 
 clean:
 	rm -rf build dist $(DEMO_OUT) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis .coverage
