@@ -83,7 +83,7 @@ def photometric_loss(
         relaxation: weight of the mean over all hypotheses.
     """
     flow, stride = output
-    batch, hypotheses, _, rows, columns = flow.shape
+    batch, hypotheses = flow.shape[:2]
     source, target = _normalised(source), _normalised(target)
     errors = flow.new_zeros(batch, hypotheses)
     for shrink, weight in ((stride * 2, 0.5), (stride, 1.0)):
@@ -92,7 +92,7 @@ def photometric_loss(
             level_flow = F.avg_pool2d(level_flow, shrink // stride)
         level_source = F.avg_pool2d(source, shrink).repeat_interleave(hypotheses, dim=0)
         level_target = F.avg_pool2d(target, shrink).repeat_interleave(hypotheses, dim=0)
-        errors = errors + weight * _charbonnier(level_source, level_target, level_flow).unflatten(0, (batch, -1))
+        errors = errors + weight * _charbonnier(level_source, level_target, level_flow).view(batch, -1)
     _, winners = errors.min(dim=1)
     winning = flow[torch.arange(batch, device=flow.device), winners]
     fine = stride // 2
@@ -110,7 +110,7 @@ def select_hypothesis(output: ViflowOutput, source: torch.Tensor, target: torch.
         source, target: [B, 1, H, W] in 0..1.
     """
     flow, stride = output
-    batch, hypotheses, _, _, _ = flow.shape
+    batch, hypotheses = flow.shape[:2]
     if hypotheses == 1:
         return torch.zeros(batch, dtype=torch.int64, device=flow.device)
     shrink = max(stride, 4)
@@ -126,7 +126,7 @@ def select_hypothesis(output: ViflowOutput, source: torch.Tensor, target: torch.
         level_target.repeat_interleave(hypotheses, dim=0),
         level_flow,
     )
-    return errors.unflatten(0, (batch, -1)).argmin(dim=1)
+    return errors.view(batch, -1).argmin(dim=1)
 
 
 def reconstruction_loss(

@@ -9,21 +9,26 @@ coarsest stride); what lies beyond the source image repeats its border.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from viflow_anomaly.config import ViewConfig
-from viflow_anomaly.errors import InvalidInputError
+from viflow_anomaly.errors import InvalidInputError, TooLargeError
 from viflow_anomaly.geometry import Float32Array, pixel_grid, project_rays, unproject_pixels
-from viflow_anomaly.sensor_data import PinholeCamera, Uint8Array
+from viflow_anomaly.sensor_data import DistortionModel, Float64Array, PinholeCamera, Uint8Array
 
 SIDE_MULTIPLE_PX = 32
 LENS_LATTICE_PX = 8
 """Lens maps are solved on a lattice of 8 source pixels and interpolated: the error stays below 0.03 px."""
+MAX_SIDE_PX = 32767
+MAX_ROUND_TRIP_PX = 1.0
+"""A lens is understood where undoing and redoing its distortion comes back this close."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,12 +36,24 @@ class _LensMaps:
     """Lookup tables of a distorted camera.
 
     Attributes:
+        camera: whose distortion they undo.
         source_of_view: [h, w, 2] source pixel of every view pixel.
         view_of_source: [H, W, 2] view pixel of every source pixel.
     """
 
+    camera: PinholeCamera
     source_of_view: Float32Array
     view_of_source: Float32Array
+
+    def distorted_flow(self, view: InternalView, flow_view_px: Float32Array, stride: int) -> Float32Array:
+        """Flow of the ideal view [h', w', 2] -> flow in distorted source pixels at the same cells."""
+        height, width = flow_view_px.shape[:2]
+        offset = (pixel_grid(height, width) + np.float32(0.5)) * np.float32(stride) - np.float32(0.5)
+        from_middle = (offset - np.array(view.middle_px, dtype=np.float32)).astype(np.float32)
+        to_ray = np.array(view.step_px, dtype=np.float32) / np.array((self.camera.fx, self.camera.fy), dtype=np.float32)
+        source = project_rays(self.camera, (from_middle * to_ray).astype(np.float32))
+        target = project_rays(self.camera, ((from_middle + flow_view_px) * to_ray).astype(np.float32))
+        return np.asarray(target - source, dtype=np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +67,7 @@ class InternalView:
         source_width, source_height: of the image as it was sent.
         step_px: (x, y) source pixels for one view pixel.
         center_px: (u, v) source pixel in the middle of the view.
-        camera: the source's calibration when its distortion is undone here, else None.
+        lens: how the source's distortion is undone, else None.
     """
 
     width: int
@@ -59,7 +76,6 @@ class InternalView:
     source_height: int
     step_px: tuple[float, float]
     center_px: tuple[float, float]
-    camera: PinholeCamera | None = None
     lens: _LensMaps | None = None
 
     @property
@@ -69,7 +85,7 @@ class InternalView:
 
     def render(self, image: Uint8Array) -> Uint8Array:
         """Source image [H, W] -> view [h, w]; shrinking is antialiased by averaging whole blocks first."""
-        block = max(1, round(min(self.step_px)))
+        block = min(max(1, round(min(self.step_px))), *image.shape)
         if block > 1:
             rows, columns = image.shape[0] // block, image.shape[1] // block
             image = np.asarray(
@@ -77,14 +93,14 @@ class InternalView:
                 dtype=np.uint8,
             )
         if self.lens is not None:
-            maps = (self.lens.source_of_view + np.float32(0.5)) / np.float32(block) - np.float32(0.5)
-            warped = cv2.remap(image, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-        else:
-            matrix = self._source_of_view_affine(block)
-            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            size = (self.width, self.height)
-            warped = cv2.warpAffine(image, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(warped, dtype=np.uint8)
+            at_px = (self.lens.source_of_view + np.float32(0.5)) / np.float32(block) - np.float32(0.5)
+            return np.asarray(_sample(image, at_px), dtype=np.uint8)
+        scales = [step / block for step in self.step_px]
+        offsets = [
+            (center + 0.5) / block - 0.5 - middle * scale
+            for center, middle, scale in zip(self.center_px, self.middle_px, scales, strict=True)
+        ]
+        return np.asarray(_sample_affine(image, scales, offsets, (self.width, self.height)), dtype=np.uint8)
 
     def covered(self) -> NDArray[np.bool_]:
         """[h, w]: view pixels that show the source image rather than its repeated border."""
@@ -106,23 +122,23 @@ class InternalView:
         Returns:
             [H, W, 2] float32 (u, v).
         """
-        flow = flow_view_px if self.camera is None else self._distorted_flow(flow_view_px, stride)
-        size = (self.source_width, self.source_height)
         if self.lens is not None:
             cells = (self.lens.view_of_source + np.float32(0.5)) / np.float32(stride) - np.float32(0.5)
-            spread = cv2.remap(flow, cells, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+            spread = _sample(self.lens.distorted_flow(self, flow_view_px, stride), cells)
         else:
-            flow = flow * np.array(self.step_px, dtype=np.float32)
-            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            matrix = self._cell_of_source_affine(stride)
-            spread = cv2.warpAffine(flow, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(cv2.add(np.asarray(spread), _source_grid(self.source_height, self.source_width)))
+            scales = [1 / (step * stride) for step in self.step_px]
+            offsets = [
+                (middle + 0.5) / stride - 0.5 - center * scale
+                for center, middle, scale in zip(self.center_px, self.middle_px, scales, strict=True)
+            ]
+            flow = flow_view_px * np.array(self.step_px, dtype=np.float32)
+            spread = _sample_affine(flow, scales, offsets, (self.source_width, self.source_height))
+        return np.asarray(cv2.add(spread, _source_grid(self.source_height, self.source_width)), dtype=np.float32)
 
     def analyzed(self) -> NDArray[np.bool_] | None:
         """[H, W]: source pixels that the view shows, or None when it shows all of them."""
         if self.lens is not None:
-            view = self.lens.view_of_source
-            return np.asarray(((view >= -0.5) & (view <= (self.width - 0.5, self.height - 0.5))).all(axis=-1))
+            return self._shown_through(self.lens)
         x, y, width, height = self.region()
         if (width, height) == (self.source_width, self.source_height):
             return None
@@ -131,12 +147,11 @@ class InternalView:
         return mask
 
     def region(self) -> tuple[int, int, int, int]:
-        """(x, y, width, height): bounding box of the analysed source pixels."""
+        """(x, y, width, height): bounding box of the analysed source pixels; 0 wide and high when there are none."""
         if self.lens is not None:
-            rows = np.flatnonzero((mask := self.analyzed()).any(axis=1))  # type: ignore[union-attr]
-            columns = np.flatnonzero(mask.any(axis=0))  # type: ignore[union-attr]
-            x, y = int(columns[0]), int(rows[0])
-            return x, y, int(columns[-1]) - x + 1, int(rows[-1]) - y + 1
+            mask = self._shown_through(self.lens)
+            x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+            return x, y, width, height
         spans = []
         sides = ((self.width, self.source_width), (self.height, self.source_height))
         for (side, limit), step, center in zip(sides, self.step_px, self.center_px, strict=True):
@@ -144,33 +159,27 @@ class InternalView:
             last = min(limit - 1, math.floor(center + side / 2 * step + 1e-6 - 1e-3))
             spans.append((first, last - first + 1))
         (x, width), (y, height) = spans
-        return x, y, width, height
+        return (x, y, width, height) if width > 0 and height > 0 else (0, 0, 0, 0)
 
-    def _source_of_view_affine(self, block: int) -> NDArray[np.float64]:
-        rows = []
-        for axis, (step, center, middle) in enumerate(zip(self.step_px, self.center_px, self.middle_px, strict=True)):
-            scale = step / block
-            offset = (center + 0.5) / block - 0.5 - middle * scale
-            rows.append([scale * (axis == 0), scale * (axis == 1), offset])
-        return np.array(rows)
+    def _shown_through(self, lens: _LensMaps) -> NDArray[np.bool_]:
+        view = lens.view_of_source
+        return np.asarray(((view >= -0.5) & (view <= (self.width - 0.5, self.height - 0.5))).all(axis=-1))
 
-    def _cell_of_source_affine(self, stride: int) -> NDArray[np.float64]:
-        rows = []
-        for axis, (step, center, middle) in enumerate(zip(self.step_px, self.center_px, self.middle_px, strict=True)):
-            scale = 1 / (step * stride)
-            offset = (middle + 0.5) / stride - 0.5 - center * scale
-            rows.append([scale * (axis == 0), scale * (axis == 1), offset])
-        return np.array(rows)
 
-    def _distorted_flow(self, flow_view_px: Float32Array, stride: int) -> Float32Array:
-        """Flow of the ideal view [h', w', 2] -> flow in distorted source pixels at the same cells."""
-        assert self.camera is not None
-        height, width = flow_view_px.shape[:2]
-        cells = (pixel_grid(height, width) + 0.5) * stride - 0.5 - np.array(self.middle_px, dtype=np.float32)
-        to_ray = np.array(self.step_px, dtype=np.float32) / np.array((self.camera.fx, self.camera.fy), dtype=np.float32)
-        source = project_rays(self.camera, cells * to_ray)
-        target = project_rays(self.camera, (cells + flow_view_px) * to_ray)
-        return np.asarray(target - source, dtype=np.float32)
+def _sample(array: NDArray[Any], at_px: Float32Array) -> NDArray[Any]:
+    """Bilinear samples of [H, W(, C)] at [h, w, 2] pixel coordinates; the border is repeated."""
+    return cv2.remap(  # type: ignore[call-overload, no-any-return]  # the stubs lack the two-channel map
+        array, at_px, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+
+
+def _sample_affine(
+    array: NDArray[Any], scales: Sequence[float], offsets: Sequence[float], size: tuple[int, int]
+) -> NDArray[Any]:
+    """Bilinear samples of [H, W(, C)] at pixel * scale + offset, for every pixel of an image of ``size`` (w, h)."""
+    matrix = np.array([[scales[0], 0.0, offsets[0]], [0.0, scales[1], offsets[1]]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpAffine(array, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
 
 
 @lru_cache(maxsize=8)
@@ -184,8 +193,16 @@ def make_view(config: ViewConfig, *, width: int, height: int, camera: PinholeCam
     """The view of a width x height source image, cached by value (lens maps take milliseconds to solve).
 
     Raises:
-        InvalidInputError: ``image_smaller_than_crop`` when the paper's crop does not fit.
+        InvalidInputError: ``image_smaller_than_crop`` when the paper's crop does not fit; ``camera_invalid`` when the
+            distortion cannot be undone or the principal point is too far from the image.
+        TooLargeError: ``image_too_large``, a side beyond 32767 px (a limit of cv2.remap).
     """
+    if max(width, height) > MAX_SIDE_PX:
+        raise TooLargeError(
+            f"image: expected sides of at most {MAX_SIDE_PX} px, found {width}x{height}",
+            code="image_too_large",
+            field="image",
+        )
     if config.mode == "center_crop":
         return _crop_view(config, width, height)
     if camera is None:
@@ -213,42 +230,35 @@ def _shrunk_view(config: ViewConfig, width: int, height: int) -> InternalView:
     return InternalView(_padded(width / step), _padded(height / step), width, height, (step, step), center)
 
 
-_CameraKey = tuple[float, float, float, float, str, tuple[float, ...]]
+_CameraKey = tuple[float, float, float, float, DistortionModel, tuple[float, ...]]
 
 
 @lru_cache(maxsize=8)
 def _pinhole_view(config: ViewConfig, width: int, height: int, key: _CameraKey) -> InternalView:
     fx, fy, cx, cy, model, coefficients = key
-    camera = PinholeCamera(
-        fx=fx,
-        fy=fy,
-        cx=cx,
-        cy=cy,
-        width=width,
-        height=height,
-        distortion_model=model,  # type: ignore[arg-type]
-        distortion_coeffs=coefficients,
-    )
+    camera = PinholeCamera(fx, fy, cx, cy, width, height, model, coefficients)
+    lattice_rays = _lattice_rays(camera) if camera.is_distorted else None
     border = np.array([(0, 0), (cx, 0), (width - 1, 0), (width - 1, cy), (width - 1, height - 1), (cx, height - 1)])
     border = np.concatenate([border, [(0, height - 1), (0, cy)]])
     reach_x, reach_y = np.abs(unproject_pixels(camera, border)).max(axis=0) * config.focal_px
-    view_width = min(_padded(2 * reach_x), _padded(config.max_width))
-    view_height = min(_padded(2 * reach_y), _padded(config.max_height))
     view = InternalView(
-        view_width,
-        view_height,
+        min(_padded(2 * reach_x), _padded(config.max_width)),
+        min(_padded(2 * reach_y), _padded(config.max_height)),
         width,
         height,
         (fx / config.focal_px, fy / config.focal_px),
         (cx, cy),
-        camera if camera.is_distorted else None,
     )
-    if not camera.is_distorted:
-        return view
-    lens = _LensMaps(_solve_source_of_view(view, camera), _solve_view_of_source(view, camera))
-    return InternalView(
-        view_width, view_height, width, height, view.step_px, view.center_px, camera, lens
-    )
+    if lattice_rays is not None:
+        view = replace(view, lens=_solve_lens_maps(view, camera, lattice_rays))
+    if not all(view.region()[2:]):
+        raise InvalidInputError(
+            f"cx, cy: expected a principal point near enough for the view around it to show a part of the {width}x"
+            f"{height} image, found ({cx:g}, {cy:g})",
+            code="camera_invalid",
+            field="camera.cx",
+        )
+    return view
 
 
 def _padded(side: float) -> int:
@@ -256,17 +266,48 @@ def _padded(side: float) -> int:
     return max(1, math.ceil(side / SIDE_MULTIPLE_PX - 0.1)) * SIDE_MULTIPLE_PX
 
 
-def _solve_source_of_view(view: InternalView, camera: PinholeCamera) -> Float32Array:
+def _lattice_rays(camera: PinholeCamera) -> Float64Array:
+    """Undistorted rays [rows, columns, 2] of every 8th source pixel, the last ones up to 7 px beyond the image.
+
+    Pixels of a fisheye that look 90 degrees or more off the axis have no place in a pinhole view: far rays.
+
+    Raises:
+        InvalidInputError: ``camera_invalid``: the distortion folds the image.
+    """
+    rows, columns = (math.ceil((side - 1) / LENS_LATTICE_PX) + 1 for side in (camera.height, camera.width))
+    pixels = pixel_grid(rows, columns) * LENS_LATTICE_PX
+    offset = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    with np.errstate(all="ignore"):  # what diverges is found below
+        rays = unproject_pixels(camera, pixels)
+        lost = ~(np.abs(project_rays(camera, rays) - pixels).max(axis=-1) <= MAX_ROUND_TRIP_PX)
+        in_order = (np.diff(rays[..., 0], axis=1) > 0).all() and (np.diff(rays[..., 1], axis=0) > 0).all()
+    if camera.distortion_model == "equidistant":
+        folds = _fisheye_folds(camera, float(np.hypot(offset[..., 0], offset[..., 1]).max()))
+    else:
+        folds = lost.any() or not in_order
+    if folds:
+        raise InvalidInputError(
+            "distortion_coeffs: expected a distortion that can be undone over the whole image, "
+            f"found {list(camera.distortion_coeffs)} for {camera.distortion_model}, which folds the image",
+            code="camera_invalid",
+            field="camera.distortion_coeffs",
+        )
+    return np.where(lost[..., None], offset * 1e4, rays)
+
+
+def _fisheye_folds(camera: PinholeCamera, radius: float) -> bool:
+    """Whether two angles below 90 degrees meet within ``radius`` (focal lengths) of the principal point."""
+    angles = np.linspace(0.0, 0.5 * np.pi, 513)[:-1]
+    curve = (project_rays(camera, np.stack([np.tan(angles), 0 * angles], axis=-1))[:, 0] - camera.cx) / camera.fx
+    within = np.logical_and.accumulate(curve[:-1] < radius)
+    return bool((np.diff(curve)[within] <= 0).any())
+
+
+def _solve_lens_maps(view: InternalView, camera: PinholeCamera, lattice_rays: Float64Array) -> _LensMaps:
+    """Lookup tables of a view that has none yet."""
     offset = pixel_grid(view.height, view.width) - view.middle_px
-    rays = offset * np.array(view.step_px) / (camera.fx, camera.fy)
-    return np.asarray(project_rays(camera, rays), dtype=np.float32)
-
-
-def _solve_view_of_source(view: InternalView, camera: PinholeCamera) -> Float32Array:
-    rows = math.ceil(view.source_height / LENS_LATTICE_PX) + 1
-    columns = math.ceil(view.source_width / LENS_LATTICE_PX) + 1
-    lattice = pixel_grid(rows, columns) * LENS_LATTICE_PX
-    rays = unproject_pixels(camera, lattice)
-    coarse = rays * np.array((camera.fx, camera.fy)) / view.step_px + view.middle_px
+    source_of_view = project_rays(camera, offset * np.array(view.step_px) / (camera.fx, camera.fy))
+    coarse = lattice_rays * np.array((camera.fx, camera.fy)) / view.step_px + view.middle_px
     cells = pixel_grid(view.source_height, view.source_width) / np.float32(LENS_LATTICE_PX)
-    return np.asarray(cv2.remap(coarse.astype(np.float32), cells, None, cv2.INTER_LINEAR), dtype=np.float32)  # type: ignore[call-overload]
+    view_of_source = np.asarray(_sample(coarse.astype(np.float32), cells), dtype=np.float32)
+    return _LensMaps(camera, source_of_view.astype(np.float32), view_of_source)

@@ -1,8 +1,9 @@
 """The compact preset: VIFlow's parts in a fully convolutional network that trains and runs on a CPU.
 
 Global shifter: the gyro's rotation between the frames, through a learned 3x3 mounting that starts at the identity,
-moves every ray exactly; the motion code adds an eight-parameter quadratic motion model for each hypothesis. Local shifter: encoder and top-down decoder on the source image alone, each scale modulated
-by the motion code (the paper's fusion, without a fixed image size). Hypotheses differ in both.
+moves every ray exactly; the motion code adds an eight-parameter quadratic motion model for each hypothesis. Local
+shifter: encoder and top-down decoder on the source image alone, each scale modulated by the motion code (the paper's
+fusion, without a fixed image size). Hypotheses differ in both.
 """
 
 from __future__ import annotations
@@ -185,11 +186,14 @@ def _rotation_matrix(theta: torch.Tensor) -> torch.Tensor:
     """Rodrigues: rotation vectors [B, 3] in rad -> matrices [B, 3, 3]; smooth at zero."""
     x, y, z = theta.unbind(dim=1)
     zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).unflatten(1, (3, 3))
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).reshape(-1, 3, 3)
     angle2 = theta.square().sum(dim=1)[:, None, None] + 1e-12
     angle = angle2.sqrt()
     identity = torch.eye(3, device=theta.device, dtype=theta.dtype)
-    return identity + torch.sin(angle) / angle * cross + (1 - torch.cos(angle)) / angle2 * (cross @ cross)
+    turned: torch.Tensor = (
+        identity + torch.sin(angle) / angle * cross + (1 - torch.cos(angle)) / angle2 * (cross @ cross)
+    )
+    return turned
 
 
 def _doubled(features: torch.Tensor) -> torch.Tensor:

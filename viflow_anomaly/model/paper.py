@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from torch import nn
 
@@ -37,7 +39,7 @@ class PaperGlobalShifter(nn.Module):
         """motion [B, T, 6] -> code [B, 512], affine matrices [B, K, 2, 3]."""
         code = self.trunk(motion.flatten(1))
         matrices = torch.stack([layer(code) for layer in self.affine], dim=1)
-        return code, matrices.unflatten(-1, (2, 3))
+        return code, matrices.view(-1, len(self.affine), 2, 3)
 
 
 class PaperDecoder(nn.Module):
@@ -47,7 +49,7 @@ class PaperDecoder(nn.Module):
         super().__init__()
         filters = (LOCAL_FILTERS[-1], *reversed(LOCAL_FILTERS))
         layers: list[nn.Module] = []
-        for filters_in, filters_out in zip(filters[:-1], filters[1:], strict=True):
+        for filters_in, filters_out in pairwise(filters):
             layers += [
                 nn.ConvTranspose2d(filters_in, filters_out, 5, stride=2, padding=2, output_padding=1),
                 nn.ReLU(inplace=True),
@@ -83,7 +85,7 @@ class PaperViflow(nn.Module):
         self.global_shifter = PaperGlobalShifter(motion_numbers=motion_rows * 6, hypotheses=hypotheses)
         filters = (1, *LOCAL_FILTERS)
         layers: list[nn.Module] = []
-        for filters_in, filters_out in zip(filters[:-1], filters[1:], strict=True):
+        for filters_in, filters_out in pairwise(filters):
             layers += [nn.Conv2d(filters_in, filters_out, 5, stride=2, padding=2), nn.ReLU(inplace=True)]
         self.encoder = nn.Sequential(*layers)
         self.code_shape = (LOCAL_FILTERS[-1], height // 32, width // 32)
