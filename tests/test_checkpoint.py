@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import save as save_tensors
 from torch import nn
 
 from viflow_anomaly import checkpoint as checkpoint_module
@@ -243,15 +244,15 @@ def test_no_state(tmp_path: Path) -> None:
 
 
 def _without_record(path: Path) -> None:
-    path.write_bytes(checkpoint_module.save_tensors({"a": torch.zeros(1)}, metadata={"other": "{}"}))
+    path.write_bytes(save_tensors({"a": torch.zeros(1)}, metadata={"other": "{}"}))
 
 
 def _without_metadata(path: Path) -> None:
-    path.write_bytes(checkpoint_module.save_tensors({"a": torch.zeros(1)}))
+    path.write_bytes(save_tensors({"a": torch.zeros(1)}))
 
 
 def _record_not_json(path: Path) -> None:
-    path.write_bytes(checkpoint_module.save_tensors({"a": torch.zeros(1)}, metadata={"record": "{"}))
+    path.write_bytes(save_tensors({"a": torch.zeros(1)}, metadata={"record": "{"}))
 
 
 @pytest.mark.parametrize("harm", [_truncate, _empty, _pickle, _without_record, _without_metadata, _record_not_json])

@@ -97,7 +97,7 @@ class TrainingRun:
             self.network.load_state_dict(_below(tensors, "model."))
             self._restore_optimizer(_below(tensors, "optimizer."))
             self.step = int(record["step"])
-        except (RuntimeError, ValueError, KeyError) as err:
+        except (RuntimeError, ValueError, LookupError) as err:
             raise CheckpointError(
                 f"{folder}: expected the whole state of this training, found: {' '.join(str(err).split())[:300]}",
                 code="checkpoint_corrupt",
@@ -153,11 +153,13 @@ def train(
         The path of the finished ``model.safetensors``.
 
     Raises:
-        ConfigError: ``training_exists``, ``resume_config_differs``, ``device_unavailable``.
+        ConfigError: ``training_exists``, ``resume_config_differs``, ``device_unavailable``, ``config_invalid`` (a loss
+            that does not fit the model).
         DatasetError: as ``load_training_data`` and, before anything is learnt, ``require_ground_truth``.
         CheckpointError: ``checkpoint_corrupt`` for the state to go on from.
     """
     require_device(device)
+    _require_matching_loss(model, training)
     require_ground_truth(validation)
     torch.set_num_threads(training.threads)
     run = TrainingRun(model=model, training=training, device=device)
@@ -216,6 +218,16 @@ def _run_steps(
     if errors is None and validation:
         errors = _validate(run, validation)
     return errors
+
+
+def _require_matching_loss(model: ModelConfig, training: TrainingConfig) -> None:
+    if training.loss == "squared" and model.preset != "paper":
+        raise ConfigError(
+            "training.loss: expected 'charbonnier' for a model whose flow is coarser than its image "
+            f"({model.preset}), found 'squared'",
+            code="config_invalid",
+            field="training.loss",
+        )
 
 
 def _provenance_metrics(errors: EndpointErrors | None) -> dict[str, Any]:

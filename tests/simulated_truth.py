@@ -1,0 +1,32 @@
+"""Ground truth beside an EuRoC-style world, without a simulator."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from worlds import World, make_world, write_euroc
+
+from viflow_anomaly.datasets.simulated_ground_truth import write_depth_png, write_flow_png
+
+
+def add_ground_truth(
+    folder: Path, world: World | None = None, *, shift_px: float = 2.0, valid: NDArray[np.bool_] | None = None
+) -> Path:
+    """A recording in EuRoC layout whose static world moves ``shift_px`` to the left a frame; returns its folder."""
+    world = world or make_world(frames=3)
+    write_euroc(folder, world)
+    truth = folder / "mav0" / "groundtruth0"
+    height, width = world.images[0].shape
+    flow = np.zeros((height, width, 2), np.float32)
+    flow[..., 0] = -shift_px
+    known = np.ones((height, width), np.bool_) if valid is None else valid
+    for name in ("depth", "static_flow"):
+        (truth / name).mkdir(parents=True)
+    stamps = world.frame_timestamps_ns.tolist()
+    for stamp in stamps:
+        write_depth_png(truth / "depth" / f"{stamp}.png", np.full((height, width), 10.0, np.float32))
+    for stamp in stamps[:-1]:
+        write_flow_png(truth / "static_flow" / f"{stamp}.png", flow, known)
+    return folder
