@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from worlds import textured_image
 
 from viflow_anomaly.config import ViewConfig
 from viflow_anomaly.errors import InvalidInputError, TooLargeError
 from viflow_anomaly.geometry import pixel_grid, project_rays, unproject_pixels
 from viflow_anomaly.sensor_data import DistortionModel, PinholeCamera
 from viflow_anomaly.view import SIDE_MULTIPLE_PX, InternalView, make_view
-from worlds import textured_image
 
 WHOLE = ViewConfig()
 CROP = ViewConfig(mode="center_crop")
@@ -101,7 +101,7 @@ def test_a_constant_flow_comes_back_in_source_pixels(
 ) -> None:
     view = make_view(config, width=width, height=height, camera=camera)
     target = view.target_coordinates(constant_flow(view, stride, (5.0, -3.0)), stride)
-    expected = source_pixels(view, camera, view_pixels(view, camera) + (5.0, -3.0))
+    expected = source_pixels(view, camera, view_pixels(view, camera) + np.array([5.0, -3.0]))
     inner = interior(view, camera, stride)
     assert np.abs(target - expected)[inner].max() < TOLERANCE_PX * max(1.0, *view.step_px)
 
@@ -137,7 +137,7 @@ def test_a_whole_step_moves_whole_pixels_exactly(config: ViewConfig, width: int,
     assert view.step_px == (step, step)
     target = view.target_coordinates(constant_flow(view, 4, (2.0, -1.0)), 4)
     np.testing.assert_allclose(
-        target - pixel_grid(height, width), np.full_like(target, 0) + (2 * step, -step), atol=1e-4
+        target - pixel_grid(height, width), np.broadcast_to((2.0 * step, -1.0 * step), target.shape), atol=1e-4
     )
 
 
@@ -166,14 +166,14 @@ def test_a_ramp_is_seen_where_it_is(
     config: ViewConfig, width: int, height: int, camera: PinholeCamera | None, axis: int
 ) -> None:
     view = make_view(config, width=width, height=height, camera=camera)
-    slope = 250.0 / max(width, height)
+    slope = 250.0 / (width, height)[axis]
     rising = np.round(pixel_grid(height, width)[..., axis] * slope).astype(np.uint8)
     up, down = (view.render(image).astype(np.float64) for image in (rising, 250 - rising))
     assert up.shape == (view.height, view.width)
     seen = 125.0 + (up - down) / 2  # OpenCV rounds halves up: a falling ramp takes that bias out again
     expected = source_pixels(view, camera, pixel_grid(view.height, view.width).astype(np.float64))[..., axis] * slope
     difference_px = (seen - expected)[inner_part(view)] / slope
-    assert abs(difference_px.mean()) < TOLERANCE_PX
+    assert abs(difference_px.mean()) < 2 * TOLERANCE_PX  # the ramp itself comes in whole gray levels
     assert np.abs(difference_px).max() * slope < 1.1
 
 
