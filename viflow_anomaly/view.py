@@ -288,7 +288,7 @@ def _lattice_rays(camera: PinholeCamera) -> Float64Array:
     if folds:
         raise InvalidInputError(
             "distortion_coeffs: expected a distortion that can be undone over the whole image, "
-            f"found {list(camera.distortion_coeffs)} for {camera.distortion_model}, which folds the image",
+            f"found {list(camera.distortion_coeffs)} for {camera.distortion_model}, which folds it or is too strong",
             code="camera_invalid",
             field="camera.distortion_coeffs",
         )
