@@ -137,6 +137,13 @@ def _read(path: Path) -> bytes:
 
 def _read_record(path: Path) -> CheckpointRecord:
     record_path = path.with_suffix(".json")
+    if not record_path.exists():
+        raise CheckpointError(
+            f"{path}: expected a checkpoint of this package, tensors with {record_path} beside them, "
+            "found no such file (others, pickles among them, are not read)",
+            code="checkpoint_missing",
+            field="checkpoint",
+        )
     data = _read(record_path)
     if len(data) > MAX_RECORD_BYTES:
         raise _invalid_record(record_path, f"expected at most {MAX_RECORD_BYTES} bytes, found {len(data)}")
