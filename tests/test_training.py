@@ -186,12 +186,10 @@ def test_resume_without_a_state_starts_anew(recordings: list[Path], tmp_path: Pa
 @pytest.mark.parametrize("section", ["model", "training"])
 def test_resume_with_another_configuration_is_refused(recordings: list[Path], tmp_path: Path, section: str) -> None:
     fit(recordings, tmp_path, training=changed(TRAINING, steps=1))
-    other: dict[str, Any] = {
-        "model": {"training": changed(TRAINING, steps=1), "model": MODEL.model_copy(update={"hypotheses": 1})},
-        "training": {"training": changed(TRAINING, steps=2)},
-    }[section]
+    model = MODEL.model_copy(update={"hypotheses": 1}) if section == "model" else MODEL
+    steps = 2 if section == "training" else 1
     with pytest.raises(ConfigError, match=f"--resume expects the {section}") as raised:
-        fit(recordings, tmp_path, resume=True, **other)
+        fit(recordings, tmp_path, model=model, training=changed(TRAINING, steps=steps), resume=True)
     assert (raised.value.code, raised.value.field) == ("resume_config_differs", section)
     assert str(tmp_path) in raised.value.message
 
