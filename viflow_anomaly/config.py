@@ -55,14 +55,17 @@ class ViewConfig(FrozenConfig):
     """Which part of the image a network sees, and at which scale.
 
     ``whole``: the whole image is resampled to a pinhole view of focal length ``focal_px`` without distortion when the
-    camera is known, else shrunk to ``max_width`` (never enlarged). ``center_crop``: the paper's middle crop of
-    ``crop_size`` pixels, not resampled.
+    camera is known (at most ``max_pinhole_width`` x ``max_pinhole_height``: a wide lens spreads far without its
+    distortion), else shrunk to ``max_width`` x ``max_height`` (never enlarged). ``center_crop``: the paper's middle
+    crop of ``crop_size`` pixels, not resampled.
     """
 
     mode: Literal["whole", "center_crop"] = "whole"
     focal_px: PositiveFloat = 232.0
     max_width: PositiveInt = 416
     max_height: PositiveInt = 416
+    max_pinhole_width: PositiveInt = 640
+    max_pinhole_height: PositiveInt = 512
     crop_size: PositiveInt = 224
 
 

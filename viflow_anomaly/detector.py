@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from viflow_anomaly.batch import ModelInput, collate, prepare
+from viflow_anomaly.batch import ModelInput, collate, prepare, require_device
 from viflow_anomaly.checkpoint import CheckpointRecord, load_checkpoint
 from viflow_anomaly.config import DetectorConfig
 from viflow_anomaly.detection import (
@@ -23,7 +23,6 @@ from viflow_anomaly.detection import (
     Roi,
     rois_from_regions,
 )
-from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.geometry import Float32Array, pixel_grid
 from viflow_anomaly.losses import select_hypothesis
 from viflow_anomaly.regions import find_regions
@@ -88,12 +87,7 @@ class AnomalyDetector:
             CheckpointError: as ``load_checkpoint``.
             ConfigError: ``device_unavailable``.
         """
-        if torch.device(device).type == "cuda" and not torch.cuda.is_available():
-            raise ConfigError(
-                f"device: expected one that this machine has, found {device!r} and no CUDA device",
-                code="device_unavailable",
-                field="device",
-            )
+        require_device(device)
         network, record = load_checkpoint(path)
         network = network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         return cls(network, record, config=config or DetectorConfig(), device=device)

@@ -242,8 +242,8 @@ def _pinhole_view(config: ViewConfig, width: int, height: int, key: _CameraKey) 
     border = np.concatenate([border, [(0, height - 1), (0, cy)]])
     reach_x, reach_y = np.abs(unproject_pixels(camera, border)).max(axis=0) * config.focal_px
     view = InternalView(
-        min(_padded(2 * reach_x), _padded(config.max_width)),
-        min(_padded(2 * reach_y), _padded(config.max_height)),
+        min(_padded(2 * reach_x), _padded(config.max_pinhole_width)),
+        min(_padded(2 * reach_y), _padded(config.max_pinhole_height)),
         width,
         height,
         (fx / config.focal_px, fy / config.focal_px),
