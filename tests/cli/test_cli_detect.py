@@ -113,7 +113,9 @@ def test_settings_reach_the_detector(
 )
 def test_bad_images(ask: Ask, pair: PairFolder, name: str, content: bytes, code: str) -> None:
     getattr(pair, name).write_bytes(content)
-    assert ask(pair.arguments()).is_refusal(f"[{code}]")
+    answer = ask(pair.arguments())
+    assert answer.is_refusal(f"[{code}]")
+    assert f"{getattr(pair, name)}: {name}: " in answer.err
 
 
 def test_images_of_different_sizes(ask: Ask, pair: PairFolder) -> None:

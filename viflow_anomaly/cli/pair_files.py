@@ -58,8 +58,8 @@ def load_pair(files: PairFiles, *, limits: ImageLimits) -> tuple[FramePair, floa
     target_ns = _stamp(files, document, "target_timestamp_ns")
     camera = None if files.camera is None else _read_camera(files.camera)
     started = time.perf_counter()
-    source = Frame(source_ns, read_image(files.source, limits=limits, field="source"))
-    target = Frame(target_ns, read_image(files.target, limits=limits, field="target"))
+    source = _read_frame(files.source, source_ns, limits=limits, field="source")
+    target = _read_frame(files.target, target_ns, limits=limits, field="target")
     decode_ms = (time.perf_counter() - started) * 1e3
     imu = _samples(document) if document is not None else _samples_around(files.imu, source_ns, target_ns, camera)
     return FramePair(source=source, target=target, imu=imu, camera=camera), decode_ms
@@ -74,6 +74,14 @@ def _stamp(files: PairFiles, document: ImuDocument | None, name: str) -> int:
             f"{name}: expected it in {option} or in an imu.json, found neither", code="timestamp_missing", field=name
         )
     return int(found)
+
+
+def _read_frame(path: Path, timestamp_ns: int, *, limits: ImageLimits, field: str) -> Frame:
+    image = read_image(path, limits=limits, field=field)
+    try:
+        return Frame(timestamp_ns, image)
+    except InvalidInputError as err:
+        raise type(err)(f"{path}: {field}: {err.message}", code=err.code, field=f"{field}.{err.field}") from err
 
 
 def _samples(document: ImuDocument) -> ImuSamples:
