@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from pydantic import ValidationError
 
 from viflow_anomaly.config import RegionConfig
 from viflow_anomaly.regions import BoundingBox, Region, RegionResult, find_regions
@@ -385,3 +386,10 @@ def test_every_region_is_finite_and_inside_the_image(
         assert np.isfinite(numbers + [value for value in region.evidence.values() if not isinstance(value, str)]).all()
         assert 0 <= region.score <= 1
         assert 1 <= region.thickness_px <= min(box.width, box.height) + 1
+
+
+@pytest.mark.parametrize("count", [0, 4097])
+def test_the_number_of_regions_is_bounded(count: int) -> None:
+    """Components are ranked in 16 bits, and each one costs time that a request must not be able to ask for."""
+    with pytest.raises(ValidationError, match="max_regions"):
+        RegionConfig(max_regions=count)

@@ -112,7 +112,7 @@ class RegionConfig(FrozenConfig):
     opening_fraction: float = Field(default=0.004, ge=0, le=0.1)
     closing_fraction: float = Field(default=0.012, ge=0, le=0.1)
     min_area_fraction: float = Field(default=0.0006, ge=0, le=1, description="of the image's area")
-    max_regions: PositiveInt = 64
+    max_regions: int = Field(default=64, ge=1, le=4096)
     min_x_extent_fraction: float = Field(default=0.018, ge=0, le=1, description="of the diagonal: narrower is a band")
     min_y_extent_fraction: float = Field(default=0.018, ge=0, le=1, description="of the diagonal: narrower is a band")
     max_aspect_ratio: float = Field(default=5.0, ge=1, description="a longer bounding box is a band")
