@@ -21,7 +21,7 @@ def serve(
 ) -> None:
     """Serve POST /detect, /healthz, /readyz and /version over HTTP until SIGINT or SIGTERM.
 
-    Limits and queue lengths are environment variables (VIFLOW_MAX_IMAGE_BYTES, ...); the README lists them.
+    Limits and queue lengths are environment variables (VIFLOW_MAX_IMAGE_BYTES, ...); docs/service.md lists them.
 
     [bold]Example[/bold]
 

@@ -35,9 +35,9 @@ def train(
 
     [bold]Examples[/bold]
 
-      viflow-anomaly train runs/sim/drone-* --validation runs/held-out/drone-000 --out runs/first --steps 20000
+      viflow-anomaly train runs/sim/drone_* --validation runs/held-out/drone_900000 --out runs/first --steps 20000
 
-      viflow-anomaly train runs/sim/drone-* --out runs/first --resume
+      viflow-anomaly train runs/sim/drone_* --out runs/first --resume
 
       viflow-anomaly train V1_01_easy/mav0 --out runs/paper --set model.preset=paper --set model.view.mode=center_crop
     """
