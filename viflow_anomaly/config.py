@@ -106,7 +106,7 @@ class RegionConfig(FrozenConfig):
     Fractions are of the image diagonal unless the name says otherwise; the residual is in gray levels 0-255.
     """
 
-    smoothing_fraction: float = Field(default=0.003, ge=0, le=0.1)
+    smoothing_fraction: float = Field(default=0.003, ge=0, le=0.02)
     threshold_mads: PositiveFloat = 6.0
     min_residual_gray: float = Field(default=12.0, ge=0, le=255)
     opening_fraction: float = Field(default=0.004, ge=0, le=0.1)

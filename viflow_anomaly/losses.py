@@ -150,8 +150,11 @@ def _normalised(image: torch.Tensor) -> torch.Tensor:
 
 
 def _charbonnier(source: torch.Tensor, target: torch.Tensor, flow_px: torch.Tensor) -> torch.Tensor:
-    """Mean error [N] over the pixels whose prediction stays inside the target."""
+    """Mean error [N]; a pixel whose prediction leaves the target costs what it would had nothing moved.
+
+    So leaving the image never pays: a hypothesis is not chosen, nor learnt, because little of it is left to judge.
+    """
     reconstruction, inside = warp(target, flow_px)
     error = torch.sqrt((reconstruction - source).square() + CHARBONNIER_EPSILON**2)
-    weight = inside.to(error.dtype)
-    return (error * weight).sum(dim=(1, 2, 3)) / weight.sum(dim=(1, 2, 3)).clamp_min(1.0)
+    unmoved = torch.sqrt((target - source).square() + CHARBONNIER_EPSILON**2)
+    return torch.where(inside, error, unmoved).mean(dim=(1, 2, 3))
