@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import time
 from typing import Any
 
 import pytest
@@ -13,9 +14,16 @@ from service_world import LiveServer, assert_problem, json_request, problem_of
 from viflow_anomaly_service.request_log import JsonLineFormatter, RequestLogMiddleware, configure_logging
 
 
-def request_lines(caplog: pytest.LogCaptureFixture) -> list[dict[str, Any]]:
+def request_lines(caplog: pytest.LogCaptureFixture, *, expected: int = 2) -> list[dict[str, Any]]:
+    """The lines of the answered requests; a line may follow its answer by a moment."""
+    deadline = time.monotonic() + 10.0
+    while time.monotonic() < deadline:
+        records = [record for record in caplog.records if record.getMessage() == "request"]
+        if len(records) >= expected:
+            break
+        time.sleep(0.01)
     formatter = JsonLineFormatter()
-    written = [formatter.format(record) for record in caplog.records if record.getMessage() == "request"]
+    written = [formatter.format(record) for record in records]
     assert all("\n" not in line and line.isascii() for line in written)
     return [json.loads(line) for line in written]
 
