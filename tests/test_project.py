@@ -16,6 +16,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from viflow_anomaly.cli.main import run
+from viflow_anomaly.datasets.registry import open_recording
 
 ROOT = Path(__file__).resolve().parents[1]
 # Written in pieces, or this file would find itself.
@@ -153,3 +154,10 @@ def test_the_demo_shows_the_best_detection(tmp_path: Path) -> None:
     )
     assert '"source_timestamp_ns": 2' in done.stdout
     assert f"{tmp_path}/overlays/2.png" in done.stdout
+
+
+def test_the_bundled_sample_is_whole_in_the_repository() -> None:
+    recording = open_recording(ROOT / "samples" / "drone")
+    images = {recording.frame_path(index).resolve() for index in range(len(recording))}
+    assert len(images) == 10
+    assert images <= {path.resolve() for path in tracked_files()}
