@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from worlds import EUROC
 
 from viflow_anomaly.geometry import (
     integrate_gyro,
@@ -24,16 +25,6 @@ from viflow_anomaly.geometry import (
 from viflow_anomaly.sensor_data import PinholeCamera
 
 # EuRoC's cam0; TUM-VI's cam0 for the equidistant model; EuRoC's with a k3 for the five-coefficient form.
-EUROC = PinholeCamera(
-    fx=458.654,
-    fy=457.296,
-    cx=367.215,
-    cy=248.375,
-    width=752,
-    height=480,
-    distortion_model="radtan",
-    distortion_coeffs=(-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05),
-)
 TUM_VI = PinholeCamera(
     fx=190.97847715128717,
     fy=190.9733070521226,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from worlds import textured_image
+from worlds import EUROC, textured_image
 
 from viflow_anomaly.config import ViewConfig
 from viflow_anomaly.errors import InvalidInputError, TooLargeError
@@ -19,16 +19,6 @@ STRIDES = (1, 4)
 TOLERANCE_PX = 0.05
 
 SCALED = PinholeCamera(fx=348.0, fy=290.0, cx=150.25, cy=130.5, width=320, height=240)
-EUROC = PinholeCamera(
-    fx=458.654,
-    fy=457.296,
-    cx=367.215,
-    cy=248.375,
-    width=752,
-    height=480,
-    distortion_model="radtan",
-    distortion_coeffs=(-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05),
-)
 FISHEYE = PinholeCamera(
     fx=190.0,
     fy=190.0,

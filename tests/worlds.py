@@ -22,6 +22,18 @@ from viflow_anomaly.sensor_data import PinholeCamera
 
 REAL_DATA = Path(os.environ.get("VIFLOW_REAL_DATA", Path(__file__).resolve().parents[1] / ".." / "shared" / "data"))
 
+# cam0 of EuRoC MAV, as its sensor.yaml has it.
+EUROC = PinholeCamera(
+    fx=458.654,
+    fy=457.296,
+    cx=367.215,
+    cy=248.375,
+    width=752,
+    height=480,
+    distortion_model="radtan",
+    distortion_coeffs=(-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05),
+)
+
 START_NS = 1_403_715_285_262_142_976
 GRAVITY_M_S2 = 9.81
 
