@@ -8,7 +8,7 @@ from worlds import textured_image
 
 from viflow_anomaly.losses import (
     photometric_loss,
-    reconstruction_loss,
+
     select_hypothesis,
     squared_error_loss,
     warp,

@@ -12,6 +12,7 @@ import torch
 from viflow_anomaly.config import ModelConfig
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.measured_flow import MeasuredFlow
 from viflow_anomaly.motion_input import MotionWindow, build_motion_window
 from viflow_anomaly.sensor_data import FramePair, Uint8Array
 from viflow_anomaly.view import InternalView, make_view
@@ -34,13 +35,20 @@ class ModelInput:
 
 
 class Batch(NamedTuple):
-    """Tensors on one device: source and target [B, 1, H, W] in 0..1, motion [B, T, 6] in rad/s and m/s^2,
-    interval_s [B]."""
+    """Tensors on one device.
+
+    Attributes:
+        source, target: [B, 1, H, W] in 0..1.
+        motion: [B, T, 6] in rad/s and m/s^2.
+        interval_s: [B].
+        measured: what the images say of their flow, one for each example (training of preset ``calibrated`` only).
+    """
 
     source: torch.Tensor
     target: torch.Tensor
     motion: torch.Tensor
     interval_s: torch.Tensor
+    measured: tuple[MeasuredFlow, ...] = ()
 
 
 def require_device(device: str) -> None:

@@ -94,7 +94,7 @@ class MotionWindowConfig(FrozenConfig):
 class ModelConfig(FrozenConfig):
     """What the builder needs to make a network; saved in its checkpoint."""
 
-    preset: Literal["paper", "compact"] = "compact"
+    preset: Literal["paper", "compact", "calibrated"] = "compact"
     hypotheses: Literal[1, 4, 8] = 8
     view: ViewConfig = ViewConfig()
     motion_window: MotionWindowConfig = MotionWindowConfig()
@@ -118,6 +118,18 @@ class RegionConfig(FrozenConfig):
     max_aspect_ratio: float = Field(default=5.0, ge=1, description="a longer bounding box is a band")
 
 
+class CorrectionConfig(FrozenConfig):
+    """How the predicted motion is refined on the target image; see ``correction``."""
+
+    enabled: bool = True
+    rounds: int = Field(default=6, ge=1, le=50)
+    tolerance_px: PositiveFloat = Field(default=0.7, description="view pixels at which a cell's weight is halved")
+    rotation_sigma_rad: PositiveFloat = Field(default=0.004, description="how far the gyro's rotation may be off")
+    translation_sigma: PositiveFloat = Field(default=1.0, description="metres; damps directions nothing speaks for")
+    lattice_step: int = Field(default=2, ge=1, le=8, description="every n-th flow cell takes part")
+    min_confident_cells: float = Field(default=20.0, ge=1, description="sum of confidences below which nothing changes")
+
+
 class DetectorConfig(FrozenConfig):
     """Everything a detection depends on besides the weights and the pair."""
 
@@ -125,6 +137,11 @@ class DetectorConfig(FrozenConfig):
     include_masks: bool = False
     min_texture_gray: float = Field(default=2.0, ge=0, description="standard deviation below which nothing is judged")
     max_exposure_jump_gray: float = Field(default=40.0, ge=0, description="change of the mean between the frames")
+
+
+def loss_of_preset(preset: str) -> str:
+    """The loss that ``TrainingConfig.loss`` "auto" stands for."""
+    return {"paper": "squared", "compact": "charbonnier", "calibrated": "corrected"}[preset]
 
 
 class TrainingConfig(FrozenConfig):
@@ -136,7 +153,7 @@ class TrainingConfig(FrozenConfig):
     warmup_steps: int = Field(default=500, ge=0)
     weight_decay: float = Field(default=1e-4, ge=0)
     gradient_clip: PositiveFloat = 1.0
-    loss: Literal["squared", "charbonnier"] = "charbonnier"
+    loss: Literal["auto", "squared", "charbonnier", "corrected"] = "auto"
     relaxation: float = Field(default=0.05, ge=0, lt=1, description="weight of the mean over hypotheses")
     look_aheads: tuple[int, ...] = (1, 2)
     seed: int = 0

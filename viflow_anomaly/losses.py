@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812  # torch's own convention
@@ -82,7 +82,7 @@ def photometric_loss(
         source, target: [B, 1, H, W], H and W multiples of 2 S.
         relaxation: weight of the mean over all hypotheses.
     """
-    flow, stride = output
+    flow, stride = output.flow_px, output.stride
     batch, hypotheses = flow.shape[:2]
     source, target = _normalised(source), _normalised(target)
     errors = flow.new_zeros(batch, hypotheses)
@@ -102,6 +102,17 @@ def photometric_loss(
     return LossResult(coarse.loss + fine_error.mean(), winners)
 
 
+def photometric_error(
+    flow_px: torch.Tensor, source: torch.Tensor, target: torch.Tensor, *, stride: int
+) -> torch.Tensor:
+    """Charbonnier error [B] of one flow [B, 2, h, w], on its own grid and at twice its resolution."""
+    source, target = _normalised(source), _normalised(target)
+    coarse = _charbonnier(F.avg_pool2d(source, stride), F.avg_pool2d(target, stride), flow_px / stride)
+    fine = stride // 2
+    fine_flow = F.interpolate(flow_px, scale_factor=2.0, mode="bilinear", align_corners=False) / fine
+    return coarse + _charbonnier(F.avg_pool2d(source, fine), F.avg_pool2d(target, fine), fine_flow)
+
+
 def select_hypothesis(output: ViflowOutput, source: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """The hypothesis whose reconstruction fits best, judged as in training on a coarse grid: [B] int64.
 
@@ -109,7 +120,7 @@ def select_hypothesis(output: ViflowOutput, source: torch.Tensor, target: torch.
         output: [B, K, 2, h, w] hypotheses.
         source, target: [B, 1, H, W] in 0..1.
     """
-    flow, stride = output
+    flow, stride = output.flow_px, output.stride
     batch, hypotheses = flow.shape[:2]
     if hypotheses == 1:
         return torch.zeros(batch, dtype=torch.int64, device=flow.device)
@@ -129,24 +140,10 @@ def select_hypothesis(output: ViflowOutput, source: torch.Tensor, target: torch.
     return errors.view(batch, -1).argmin(dim=1)
 
 
-def reconstruction_loss(
-    kind: Literal["squared", "charbonnier"],
-    output: ViflowOutput,
-    source: torch.Tensor,
-    target: torch.Tensor,
-    *,
-    relaxation: float,
-) -> LossResult:
-    """The loss a ``TrainingConfig`` names."""
-    if kind == "squared" or output.stride == 1:
-        return squared_error_loss(output, source, target)
-    return photometric_loss(output, source, target, relaxation=relaxation)
-
-
 def _normalised(image: torch.Tensor) -> torch.Tensor:
-    mean = image.mean(dim=(1, 2, 3), keepdim=True)
-    deviation = image.std(dim=(1, 2, 3), keepdim=True)
-    return (image - mean) / (deviation + 0.02)
+    centred = image - image.mean(dim=(1, 2, 3), keepdim=True)
+    deviation = centred.square().mean(dim=(1, 2, 3), keepdim=True).sqrt()
+    return centred / (deviation + 0.02)
 
 
 def _charbonnier(source: torch.Tensor, target: torch.Tensor, flow_px: torch.Tensor) -> torch.Tensor:

@@ -16,18 +16,21 @@ import torch
 from torch import nn
 
 from viflow_anomaly import __version__
-from viflow_anomaly.batch import require_device
+from viflow_anomaly.batch import Batch, require_device
 from viflow_anomaly.checkpoint import (
     load_training_state,
     save_checkpoint,
     save_training_state,
     source_commit,
 )
-from viflow_anomaly.config import ModelConfig, TrainingConfig
+from viflow_anomaly.config import ModelConfig, TrainingConfig, loss_of_preset
 from viflow_anomaly.errors import CheckpointError, ConfigError
 from viflow_anomaly.evaluation.endpoint_error import EndpointErrors, measure_endpoint_errors, require_ground_truth
-from viflow_anomaly.losses import reconstruction_loss
+from viflow_anomaly.losses import LossResult, photometric_loss, squared_error_loss
 from viflow_anomaly.model.builder import build_model
+from viflow_anomaly.model.calibrated import CalibratedViflow
+from viflow_anomaly.model.outputs import ViflowOutput
+from viflow_anomaly.rigid_losses import corrected_loss
 from viflow_anomaly.training_data import TrainingData, load_training_data
 from viflow_anomaly.training_progress import TrainingProgress
 
@@ -38,6 +41,7 @@ class TrainingRun:
     def __init__(self, *, model: ModelConfig, training: TrainingConfig, device: str) -> None:
         self.model_config = model
         self.config = training
+        self.loss = _loss_name(model, training)
         self.device = device
         network = build_model(model, seed=training.seed).to(device)
         self.network: nn.Module = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -57,15 +61,23 @@ class TrainingRun:
         with torch.autocast(torch.device(self.device).type, dtype=torch.bfloat16, enabled=self.config.autocast):
             output = self.network(source, batch.motion, batch.interval_s)
         output = output._replace(flow_px=output.flow_px.float())
-        loss, winners = reconstruction_loss(
-            self.config.loss, output, batch.source, batch.target, relaxation=self.config.relaxation
-        )
+        loss, winners = self._loss(output, batch)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
         self.optimizer.step()
         self.step += 1
         return float(loss.detach()), torch.bincount(winners, minlength=self.model_config.hypotheses)
+
+    def _loss(self, output: ViflowOutput, batch: Batch) -> LossResult:
+        relaxation = self.config.relaxation
+        if self.loss == "corrected":
+            assert isinstance(self.network, CalibratedViflow)
+            rays = self.network.rays(batch.source)
+            return corrected_loss(output, batch, rays, focal_px=self.network.focal_px, relaxation=relaxation)
+        if self.loss == "squared":
+            return squared_error_loss(output, batch.source, batch.target)
+        return photometric_loss(output, batch.source, batch.target, relaxation=relaxation)
 
     def save(self, folder: Path, fingerprint: Mapping[str, Any]) -> None:
         """Write the whole state atomically."""
@@ -159,7 +171,7 @@ def train(
         CheckpointError: ``checkpoint_corrupt`` for the state to go on from.
     """
     require_device(device)
-    _require_matching_loss(model, training)
+    loss = _loss_name(model, training)
     require_ground_truth(validation)
     torch.set_num_threads(training.threads)
     run = TrainingRun(model=model, training=training, device=device)
@@ -173,7 +185,7 @@ def train(
             field="out",
         )
     with TrainingProgress(out_dir, steps=training.steps, first_step=run.step, visible=progress) as reporter:
-        training_data = load_training_data(data, model, training.look_aheads, on_progress=reporter.loading)
+        training_data = load_training_data(data, model, training.look_aheads, measure=loss == "corrected", on_progress=reporter.loading)
         errors = _run_steps(run, training_data, validation, out_dir, fingerprint, reporter)
     provenance = {
         "package_version": __version__,
@@ -220,14 +232,16 @@ def _run_steps(
     return errors
 
 
-def _require_matching_loss(model: ModelConfig, training: TrainingConfig) -> None:
-    if training.loss == "squared" and model.preset != "paper":
+def _loss_name(model: ModelConfig, training: TrainingConfig) -> str:
+    """The loss that fits the preset; "auto" names it, another one is refused."""
+    fitting = loss_of_preset(model.preset)
+    if training.loss not in ("auto", fitting):
         raise ConfigError(
-            "training.loss: expected 'charbonnier' for a model whose flow is coarser than its image "
-            f"({model.preset}), found 'squared'",
+            f"training.loss: expected 'auto' or {fitting!r} for the preset {model.preset!r}, found {training.loss!r}",
             code="config_invalid",
             field="training.loss",
         )
+    return fitting
 
 
 def _provenance_metrics(errors: EndpointErrors | None) -> dict[str, Any]:

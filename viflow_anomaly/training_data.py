@@ -16,6 +16,8 @@ from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.datasets.registry import open_recording
 from viflow_anomaly.errors import DatasetError, InvalidInputError
 from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.measured_flow import MeasuredFlow, measure_flow
+from viflow_anomaly.model.layers import FLOW_STRIDE
 from viflow_anomaly.motion_input import MotionWindow, build_motion_window
 from viflow_anomaly.sensor_data import Frame, FramePair, Uint8Array
 from viflow_anomaly.view import make_view
@@ -34,6 +36,7 @@ class PairBucket:
         motion: [P, T, 6] windows.
         interval_s: [P].
         mirrorable: [P] the window is in camera axes, so that a mirrored pair has a known motion.
+        measured_px, confidence: [P, h/4, w/4(, 2)] what ``measure_flow`` found (confidence in 1/255), or None.
     """
 
     frames: Uint8Array
@@ -41,6 +44,18 @@ class PairBucket:
     motion: Float32Array
     interval_s: Float32Array
     mirrorable: NDArray[np.bool_]
+    measured_px: NDArray[np.float16] | None = None
+    confidence: Uint8Array | None = None
+
+    def measured(self, index: int, *, mirrored: bool) -> MeasuredFlow:
+        """What the images of one pair say of their flow."""
+        assert self.measured_px is not None
+        assert self.confidence is not None
+        flow = self.measured_px[index].astype(np.float32)
+        confidence = self.confidence[index].astype(np.float32) / 255
+        if mirrored:
+            flow, confidence = flow[:, ::-1] * np.float32((-1, 1)), confidence[:, ::-1]
+        return MeasuredFlow(flow, confidence)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +83,11 @@ class TrainingData:
         mirrored = (rng.random(batch_size) < 0.5) & bucket.mirrorable[chosen]
         source[mirrored], target[mirrored] = source[mirrored, :, ::-1], target[mirrored, :, ::-1]
         motion[mirrored] *= np.array(MIRRORED_MOTION_SIGNS, dtype=np.float32)
-        return collate_arrays(source, target, motion, bucket.interval_s[chosen], device)
+        batch = collate_arrays(source, target, motion, bucket.interval_s[chosen], device)
+        if bucket.measured_px is None:
+            return batch
+        measured = [bucket.measured(int(one), mirrored=bool(flip)) for one, flip in zip(chosen, mirrored, strict=True)]
+        return batch._replace(measured=tuple(measured))
 
 
 @dataclass(eq=False)
@@ -77,6 +96,8 @@ class _Growing:
     pairs: list[tuple[int, int]]
     windows: list[MotionWindow]
     mirrorable: list[bool]
+    measured_px: list[NDArray[np.float16]]
+    confidence: list[Uint8Array]
 
 
 def load_training_data(
@@ -84,17 +105,21 @@ def load_training_data(
     config: ModelConfig,
     look_aheads: Sequence[int],
     *,
+    measure: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> TrainingData:
     """Read recordings of any known layout. A pair that cannot be used is counted, by the code of its fault.
 
+    Args:
+        measure: measure the flow of every pair, too (milliseconds each, 5 bytes a flow cell).
+
     Raises:
         DatasetError: as ``open_recording``; ``training_data_empty`` when no pair is left.
     """
-    buckets: dict[tuple[int, int], _Growing] = defaultdict(lambda: _Growing([], [], [], []))
+    buckets: dict[tuple[int, int], _Growing] = defaultdict(lambda: _Growing([], [], [], [], [], []))
     excluded: Counter[str] = Counter()
     for done, path in enumerate(paths):
-        _add_recording(path, config, look_aheads, buckets, excluded)
+        _add_recording(path, config, look_aheads, buckets, excluded, measure=measure)
         if on_progress is not None:
             on_progress(done + 1, len(paths))
     filled = [buckets[size] for size in sorted(buckets) if buckets[size].pairs]
@@ -114,6 +139,8 @@ def _add_recording(
     look_aheads: Sequence[int],
     buckets: dict[tuple[int, int], _Growing],
     excluded: Counter[str],
+    *,
+    measure: bool,
 ) -> None:
     recording = open_recording(path)
     pairs = RecordingPairs(recording, look_aheads)
@@ -147,6 +174,11 @@ def _add_recording(
         bucket.pairs.append((first + source, first + target))
         bucket.windows.append(window)
         bucket.mirrorable.append(in_camera_axes)
+        if measure:
+            views = (bucket.frames[first + one] for one in (source, target))
+            measured = measure_flow(*views, stride=FLOW_STRIDE)
+            bucket.measured_px.append(measured.flow_px.astype(np.float16))
+            bucket.confidence.append((measured.confidence * 255).astype(np.uint8))
 
 
 def _finished(bucket: _Growing) -> PairBucket:
@@ -156,4 +188,6 @@ def _finished(bucket: _Growing) -> PairBucket:
         motion=np.stack([window.values for window in bucket.windows]),
         interval_s=np.array([window.interval_s for window in bucket.windows], dtype=np.float32),
         mirrorable=np.array(bucket.mirrorable, dtype=np.bool_),
+        measured_px=np.stack(bucket.measured_px) if bucket.measured_px else None,
+        confidence=np.stack(bucket.confidence) if bucket.confidence else None,
     )

@@ -35,7 +35,7 @@ def random_input(batch: int, height: int, width: int) -> tuple[torch.Tensor, tor
 @pytest.mark.parametrize(("height", "width"), [(65, 65), (224, 225), (33, 97), (224, 224), (32, 32), (1, 1)])
 def test_any_size(height: int, width: int) -> None:
     with torch.no_grad():
-        flow, stride = compact()(*random_input(2, height, width))
+        flow, stride, _ = compact()(*random_input(2, height, width))
     assert flow.shape == (2, 4, 2, -(-height // 4), -(-width // 4))
     assert stride == 4
     assert bool(torch.isfinite(flow).all())

@@ -7,6 +7,7 @@ from torch import nn
 
 from viflow_anomaly.config import ModelConfig
 from viflow_anomaly.errors import ConfigError
+from viflow_anomaly.model.calibrated import CalibratedViflow
 from viflow_anomaly.model.compact import CompactViflow
 from viflow_anomaly.model.paper import PaperViflow
 
@@ -19,14 +20,15 @@ def build_model(config: ModelConfig, *, seed: int = 0) -> nn.Module:
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        if config.preset == "compact":
-            return CompactViflow(
-                motion_rows=config.motion_window.rows,
-                interval_rows=config.motion_window.samples_between,
-                hypotheses=config.hypotheses,
-                focal_px=config.view.focal_px,
-            )
-        return _build_paper(config)
+        if config.preset == "paper":
+            return _build_paper(config)
+        network = {"compact": CompactViflow, "calibrated": CalibratedViflow}[config.preset]
+        return network(
+            motion_rows=config.motion_window.rows,
+            interval_rows=config.motion_window.samples_between,
+            hypotheses=config.hypotheses,
+            focal_px=config.view.focal_px,
+        )
 
 
 def _build_paper(config: ModelConfig) -> nn.Module:

@@ -7,6 +7,20 @@ from typing import NamedTuple
 import torch
 
 
+class RigidScene(NamedTuple):
+    """The static world and the camera's motion, from which flow follows.
+
+    Attributes:
+        inverse_depth: [B, 1, h, w] along the optical axis, in 1/m (up to the scale that motion leaves open).
+        rotation: [B, 3, 3], maps source-camera to target-camera coordinates.
+        translation_m: [B, K, 3], X_target = rotation X_source + translation, one for each hypothesis.
+    """
+
+    inverse_depth: torch.Tensor
+    rotation: torch.Tensor
+    translation_m: torch.Tensor
+
+
 class ViflowOutput(NamedTuple):
     """Flow hypotheses.
 
@@ -14,7 +28,9 @@ class ViflowOutput(NamedTuple):
         flow_px: [B, K, 2, h, w] in pixels of the network's input image, source to target; cell (i, j) is centred on
             input pixel ((j + 0.5) * stride - 0.5, (i + 0.5) * stride - 0.5).
         stride: input pixels for one cell (1: full resolution).
+        scene: what the flow was computed from, where the network knows (preset ``calibrated``).
     """
 
     flow_px: torch.Tensor
     stride: int
+    scene: RigidScene | None = None
