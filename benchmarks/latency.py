@@ -21,26 +21,26 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read once, when torch loads
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
-import torch
 
-from viflow_anomaly.batch import collate, prepare
-from viflow_anomaly.checkpoint import load_checkpoint, source_commit, write_atomically
+from viflow_anomaly.checkpoint_record import source_commit, write_atomically
 from viflow_anomaly.cli.pair_files import PairFiles, load_pair
-from viflow_anomaly.config import ImageLimits
+from viflow_anomaly.config import ImageLimits, RuntimeName
 from viflow_anomaly.detection import ImageSize, rois_from_regions
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import ViflowError
 from viflow_anomaly.geometry import Float32Array, pixel_grid, unproject_pixels
-from viflow_anomaly.losses import select_hypothesis
+from viflow_anomaly.model_input import prepare
+from viflow_anomaly.prediction import correct
 from viflow_anomaly.regions import find_regions
 from viflow_anomaly.residual import photometric_residual, reconstruct
+from viflow_anomaly.runtime.loading import load_runtime
 from viflow_anomaly.sensor_data import Frame, FramePair, PinholeCamera, Uint8Array
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -49,7 +49,7 @@ CAMERAS = ("none", "pinhole", "radtan")
 EUROC_HEIGHT_PX, EUROC_FOCAL_PX = 480, (458.654, 457.296)
 EUROC_RADTAN = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
 MIN_REPEATS = 50
-STAGES = ("view", "network", "reconstruct", "regions")
+STAGES = ("view", "network", "correction", "reconstruct", "regions")
 
 
 @dataclass(frozen=True)
@@ -102,24 +102,21 @@ def look_up(image: Uint8Array, lookup: Float32Array) -> Uint8Array:
 class Stages:
     """The detector's steps one by one, each with its own clock; the same functions in the same order."""
 
-    def __init__(self, checkpoint: Path | None, detector: AnomalyDetector) -> None:
-        network, self._record = load_checkpoint(checkpoint)
-        self._network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    def __init__(self, checkpoint: Path | None, detector: AnomalyDetector, runtime: RuntimeName) -> None:
+        self._runtime, self._record = load_runtime(checkpoint, runtime=runtime, threads=1)
         self._config = detector.config
 
     def run(self, pair: FramePair) -> list[float]:
-        """Milliseconds of view (both images and the IMU window), network, reconstruct, regions."""
+        """Milliseconds of view (both images and the IMU window), network, correction, reconstruct, regions."""
         clock = [time.perf_counter()]
         model_input = prepare(pair, self._record.model)
         clock.append(time.perf_counter())
-        batch = collate([model_input])
-        with torch.inference_mode():
-            source = batch.source.contiguous(memory_format=torch.channels_last)
-            output = self._network(source, batch.motion, batch.interval_s)
-            winner = int(select_hypothesis(output, batch.source, batch.target)[0])
-            flow = output.flow_px[0, winner].permute(1, 2, 0).contiguous().numpy()
+        hypotheses = self._runtime.predict(model_input)
         clock.append(time.perf_counter())
-        coordinates = model_input.view.target_coordinates(flow, output.stride)
+        focal_px = self._record.model.view.focal_px
+        predicted = correct(hypotheses, model_input, self._config.correction, focal_px=focal_px)
+        clock.append(time.perf_counter())
+        coordinates = model_input.view.target_coordinates(predicted.flow_px, predicted.stride)
         reconstruction, inside = reconstruct(pair.target.image, coordinates)
         if (analyzed := model_input.view.analyzed()) is not None:
             inside &= analyzed
@@ -198,7 +195,7 @@ def uncommitted_changes() -> bool | None:
 
 def circumstances(detector: AnomalyDetector, load_before: float) -> dict[str, Any]:
     """All that a reader needs to judge the numbers."""
-    packages = ("viflow-anomaly", "torch", "numpy", "opencv-python-headless", "scikit-image")
+    packages = ("viflow-anomaly", "torch", "openvino", "numpy", "opencv-python-headless", "scikit-image")
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": source_commit(),
@@ -211,6 +208,7 @@ def circumstances(detector: AnomalyDetector, load_before: float) -> dict[str, An
         "python": platform.python_version(),
         "versions": {name: version(name) for name in packages},
         "model": {"name": detector.model_info.name, "sha256": detector.model_info.sha256},
+        "runtime": detector.runtime,
     }
 
 
@@ -238,6 +236,7 @@ def markdown(results: Sequence[dict[str, Any]]) -> str:
 def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Pair to ROIs on one core, beside OpenCV's DIS medium.")
     parser.add_argument("--checkpoint", type=Path, help="weights to use instead of the bundled model")
+    parser.add_argument("--runtime", choices=get_args(RuntimeName), default="auto", help="what runs the network")
     parser.add_argument("--sample", type=Path, default=ROOT / "samples" / "drone", help="a pair as in samples/drone")
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "latency.json")
     parser.add_argument("--repeats", type=int, default=200, help=f"at least {MIN_REPEATS} (default 200)")
@@ -250,17 +249,16 @@ def parse_arguments() -> argparse.Namespace:
 
 def main() -> None:
     arguments = parse_arguments()
-    torch.set_num_threads(1)
     cv2.setNumThreads(1)
     load_before = os.getloadavg()[0]
     folder = arguments.sample
     files = PairFiles(folder / "source.png", folder / "target.png", folder / "imu.json", folder / "camera.json")
     try:
         sample, _ = load_pair(files, limits=ImageLimits())
-        detector = AnomalyDetector.from_checkpoint(arguments.checkpoint)
+        detector = AnomalyDetector.from_checkpoint(arguments.checkpoint, runtime=arguments.runtime, threads=1)
     except ViflowError as err:
         raise SystemExit(f"error: {err.message} [{err.code}]") from err
-    stages = Stages(arguments.checkpoint, detector)
+    stages = Stages(arguments.checkpoint, detector, arguments.runtime)
     results = []
     for width, height in SIZES:
         for camera in CAMERAS:

@@ -21,7 +21,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read once, when torch loa
 import numpy as np
 import torch
 
-from viflow_anomaly.checkpoint import source_commit, write_atomically
+from viflow_anomaly.checkpoint_record import source_commit, write_atomically
 from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.datasets.registry import open_recording
 from viflow_anomaly.detector import AnomalyDetector

@@ -39,19 +39,23 @@ DetectorLoader = Callable[[ServiceSettings], PairDetector]
 
 
 def load_bundled_or_configured(settings: ServiceSettings) -> PairDetector:
-    """The detector that the settings name; sets how many threads torch and OpenCV use in this process.
+    """The detector that the settings name; sets how many threads the network and OpenCV use in this process.
 
     Raises:
         CheckpointError: the checkpoint cannot be used.
     """
     import cv2  # noqa: PLC0415 - heavy, and needed only once a server really starts
-    import torch  # noqa: PLC0415
 
     from viflow_anomaly.detector import AnomalyDetector  # noqa: PLC0415
 
-    torch.set_num_threads(settings.threads)
     cv2.setNumThreads(settings.threads)
-    return AnomalyDetector.from_checkpoint(settings.checkpoint, config=settings.detector, device=settings.device)
+    return AnomalyDetector.from_checkpoint(
+        settings.checkpoint,
+        config=settings.detector,
+        device=settings.device,
+        runtime=settings.runtime,
+        threads=settings.threads,
+    )
 
 
 def create_app(

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
 from pydantic_settings import BaseSettings, SettingsConfigDict, SettingsError
 
-from viflow_anomaly.config import DetectorConfig, ImageLimits, describe_validation
+from viflow_anomaly.config import DetectorConfig, ImageLimits, RuntimeName, describe_validation
 from viflow_anomaly.errors import ConfigError
 
 MEBIBYTE = 1024 * 1024
@@ -31,6 +31,7 @@ class ServiceSettings(BaseSettings):
 
     checkpoint: Path | None = Field(default=None, description="model to load; the bundled one when not given")
     device: str = "cpu"
+    runtime: RuntimeName = Field(default="auto", description="torch, openvino, or auto: OpenVINO where it can run")
     detector: DetectorConfig = DetectorConfig()
     host: str = "127.0.0.1"
     port: int = Field(default=8000, ge=0, le=65535, description="0 takes a free one, named in the log")
@@ -38,7 +39,7 @@ class ServiceSettings(BaseSettings):
     max_image_pixels: PositiveInt = 16 * MEBIBYTE
     max_body_bytes: PositiveInt = 48 * MEBIBYTE
     max_imu_samples: PositiveInt = 20_000
-    threads: PositiveInt = Field(default=1, description="torch and OpenCV threads of one detection")
+    threads: PositiveInt = Field(default=1, description="threads of one detection")
     max_concurrent: PositiveInt = Field(default_factory=_usable_cores, description="detections running at once")
     max_queued: NonNegativeInt = Field(default=32, description="requests that may wait or upload beside them")
     queue_timeout_s: PositiveFloat = Field(default=10.0, description="longest wait for a turn")

@@ -3,35 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from viflow_anomaly.config import ModelConfig
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.measured_flow import MeasuredFlow
-from viflow_anomaly.motion_input import MotionWindow, build_motion_window
-from viflow_anomaly.sensor_data import FramePair, Uint8Array
-from viflow_anomaly.view import InternalView, make_view
-
-
-@dataclass(frozen=True, eq=False)
-class ModelInput:
-    """One pair as a network wants it, still numpy.
-
-    Attributes:
-        source, target: [h, w] uint8 views.
-        window: its ``values`` are [T, 6].
-        view: how the views came from the source image.
-    """
-
-    source: Uint8Array
-    target: Uint8Array
-    window: MotionWindow
-    view: InternalView
+from viflow_anomaly.model_input import ModelInput
+from viflow_anomaly.sensor_data import Uint8Array
 
 
 class Batch(NamedTuple):
@@ -65,18 +46,6 @@ def require_device(device: str) -> None:
             code="device_unavailable",
             field="device",
         ) from err
-
-
-def prepare(pair: FramePair, config: ModelConfig) -> ModelInput:
-    """Render the views of a pair and build its motion window.
-
-    Raises:
-        InvalidInputError: as ``make_view`` and ``build_motion_window``.
-    """
-    height, width = pair.source.image.shape
-    view = make_view(config.view, width=width, height=height, camera=pair.camera)
-    window = build_motion_window(pair, config.motion_window)
-    return ModelInput(view.render(pair.source.image), view.render(pair.target.image), window, view)
 
 
 def collate(inputs: Sequence[ModelInput], device: torch.device | str = "cpu") -> Batch:

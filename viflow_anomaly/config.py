@@ -61,11 +61,11 @@ class ViewConfig(FrozenConfig):
     """
 
     mode: Literal["whole", "center_crop"] = "whole"
-    focal_px: PositiveFloat = 232.0
-    max_width: PositiveInt = 416
-    max_height: PositiveInt = 416
-    max_pinhole_width: PositiveInt = 640
-    max_pinhole_height: PositiveInt = 512
+    focal_px: PositiveFloat = 116.0
+    max_width: PositiveInt = 208
+    max_height: PositiveInt = 208
+    max_pinhole_width: PositiveInt = 320
+    max_pinhole_height: PositiveInt = 256
     crop_size: PositiveInt = 224
 
 
@@ -118,6 +118,10 @@ class RegionConfig(FrozenConfig):
     max_aspect_ratio: float = Field(default=5.0, ge=1, description="a longer bounding box is a band")
 
 
+RuntimeName = Literal["auto", "torch", "openvino"]
+"""What runs the network: "auto" is OpenVINO on a CPU where it is installed and the checkpoint was exported."""
+
+
 class CorrectionConfig(FrozenConfig):
     """How the predicted motion is refined on the target image; see ``correction``."""
 
@@ -126,14 +130,17 @@ class CorrectionConfig(FrozenConfig):
     tolerance_px: PositiveFloat = Field(default=0.7, description="view pixels at which a cell's weight is halved")
     rotation_sigma_rad: PositiveFloat = Field(default=0.004, description="how far the gyro's rotation may be off")
     translation_sigma: PositiveFloat = Field(default=1.0, description="metres; damps directions nothing speaks for")
-    lattice_step: int = Field(default=2, ge=1, le=8, description="every n-th flow cell takes part")
-    min_confident_cells: float = Field(default=20.0, ge=1, description="sum of confidences below which nothing changes")
+    lattice_px: PositiveInt = Field(default=8, description="view pixels between the flow cells that take part")
+    min_confidence: float = Field(
+        default=0.002, ge=0, le=1, description="mean of the cells' confidence below which nothing is corrected"
+    )
 
 
 class DetectorConfig(FrozenConfig):
     """Everything a detection depends on besides the weights and the pair."""
 
     regions: RegionConfig = RegionConfig()
+    correction: CorrectionConfig = CorrectionConfig()
     include_masks: bool = False
     min_texture_gray: float = Field(default=2.0, ge=0, description="standard deviation below which nothing is judged")
     max_exposure_jump_gray: float = Field(default=40.0, ge=0, description="change of the mean between the frames")
@@ -160,6 +167,7 @@ class TrainingConfig(FrozenConfig):
     validate_every: PositiveInt = 1000
     checkpoint_every: PositiveInt = 500
     threads: PositiveInt = 1
+    relighting: float = Field(default=0.6, ge=0, le=1, description="change of exposure, contrast and noise shown")
     autocast: bool = Field(default=False, description="bfloat16 in the network; on CUDA and recent CPUs")
     validation_pairs: PositiveInt = Field(default=64, description="measured at every validation, evenly spread")
 

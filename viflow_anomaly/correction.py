@@ -91,7 +91,7 @@ def correct_motion(
         focal_px: of the view.
         config: how far and how hard.
     """
-    thin = (slice(config.lattice_step // 2, None, config.lattice_step),) * 2
+    thin = _lattice(measured, config)
     rays_thin, depth_thin = rays[thin], inverse_depth[thin]
     measured_thin, confidence = measured.flow_px[thin].reshape(-1, 2), measured.confidence[thin].reshape(-1)
     rotation, translation = start
@@ -142,7 +142,7 @@ def correct_flow(
     basis = np.stack([*turns, *others], axis=-1)  # h, w, 2, 3 + K - 1
     prior = np.full(basis.shape[-1], 1 / BLEND_SIGMA**2)
     prior[:3] = 1 / config.rotation_sigma_rad**2
-    thin = (slice(config.lattice_step // 2, None, config.lattice_step),) * 2
+    thin = _lattice(measured, config)
     basis_thin = basis[thin].reshape(-1, 2, basis.shape[-1])
     error_px = (measured.flow_px - start)[thin].reshape(-1, 2)
     confidence = measured.confidence[thin].reshape(-1)
@@ -154,6 +154,13 @@ def correct_flow(
         solution = _weighted_step(du, dv, error_px / np.float32(focal_px), weights, prior, 0 * prior)
     after = start + (basis @ solution.astype(np.float32)) * np.float32(focal_px)
     return _accepted(start, after, measured, config, None, None)
+
+
+def _lattice(measured: MeasuredFlow, config: CorrectionConfig) -> tuple[slice, slice]:
+    """Every n-th cell: neighbours err alike, so the ones between add time and little else."""
+    step = max(1, config.lattice_px // measured.stride)
+    one = slice(step // 2, None, step)
+    return one, one
 
 
 def _pull(prior: Float64Array, turned: Float64Array) -> Float64Array:
@@ -195,13 +202,14 @@ def _accepted(
 ) -> Correction:
     """Take the correction where it explains the measurement better than the prediction did."""
     total = float(measured.confidence.sum())
+    enough = config.min_confidence * measured.confidence.size
 
     def inliers(flow: Float32Array) -> float:
         weights = robust_weights(measured.flow_px - flow, measured.confidence, config.tolerance_px)
         return float(weights.sum()) / total if total > 0 else 0.0
 
     share, share_before = inliers(after), inliers(before)
-    converged = bool(np.isfinite(after).all()) and share >= share_before and total > config.min_confident_cells
+    converged = bool(np.isfinite(after).all()) and share >= share_before and total > enough
     if not converged:
         return Correction(before, start, share_before, 0.0, converged=False)
     shift = float(np.linalg.norm(after - before, axis=-1).mean())

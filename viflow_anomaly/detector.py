@@ -7,12 +7,9 @@ from pathlib import Path
 from typing import NamedTuple, Self
 
 import numpy as np
-import torch
-from torch import nn
 
-from viflow_anomaly.batch import ModelInput, collate, prepare, require_device
-from viflow_anomaly.checkpoint import CheckpointRecord, load_checkpoint
-from viflow_anomaly.config import DetectorConfig
+from viflow_anomaly.checkpoint_record import CheckpointRecord
+from viflow_anomaly.config import DetectorConfig, RuntimeName
 from viflow_anomaly.detection import (
     AnalyzedRegion,
     Detection,
@@ -24,9 +21,12 @@ from viflow_anomaly.detection import (
     rois_from_regions,
 )
 from viflow_anomaly.geometry import Float32Array, pixel_grid
-from viflow_anomaly.losses import select_hypothesis
+from viflow_anomaly.model_input import ModelInput, prepare
+from viflow_anomaly.prediction import predict_flow
 from viflow_anomaly.regions import find_regions
 from viflow_anomaly.residual import photometric_residual, reconstruct
+from viflow_anomaly.runtime.interface import Runtime
+from viflow_anomaly.runtime.loading import load_runtime
 from viflow_anomaly.sensor_data import FramePair
 
 RESIDUAL_SAMPLE_STRIDE = 3
@@ -55,46 +55,55 @@ class Analysis(NamedTuple):
     hypothesis: int
 
 
-class _Prediction(NamedTuple):
-    target_coordinates: Float32Array
-    hypothesis: int
-
-
 class AnomalyDetector:
     """Finds independent motion. Holds weights and configuration only, so that threads may share it.
 
     Args:
-        network: in evaluation mode, on ``device``.
+        runtime: of the network.
         record: where the network came from and what its input looks like.
         config: thresholds and shape rule.
-        device: torch device name.
     """
 
-    def __init__(self, network: nn.Module, record: CheckpointRecord, *, config: DetectorConfig, device: str) -> None:
-        self._network = network
+    def __init__(self, runtime: Runtime, record: CheckpointRecord, *, config: DetectorConfig) -> None:
+        self._runtime = runtime
         self._record = record
         self.config = config
-        self.device = device
         self.model_info = ModelInfo(name=record.name, version=record.version, sha256=record.sha256)
 
     @classmethod
     def from_checkpoint(
-        cls, path: Path | None = None, *, config: DetectorConfig | None = None, device: str = "cpu"
+        cls,
+        path: Path | None = None,
+        *,
+        config: DetectorConfig | None = None,
+        device: str = "cpu",
+        runtime: RuntimeName = "auto",
+        threads: int | None = None,
     ) -> Self:
         """Load a checkpoint (None: the bundled model).
 
+        Args:
+            path: a ``.safetensors`` file with its ``.json`` beside it.
+            config: thresholds and shape rule.
+            device: torch device name; another one than "cpu" needs the torch runtime.
+            runtime: "auto" takes OpenVINO where it is installed and the checkpoint was exported, else torch.
+            threads: CPU threads of the network (torch: of the whole process); None leaves the backend's own.
+
         Raises:
-            CheckpointError: as ``load_checkpoint``.
-            ConfigError: ``device_unavailable``.
+            CheckpointError: as ``load_runtime``.
+            ConfigError: ``device_unavailable``, ``runtime_unavailable``.
         """
-        require_device(device)
-        network, record = load_checkpoint(path)
-        network = network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        return cls(network, record, config=config or DetectorConfig(), device=device)
+        loaded, record = load_runtime(path, runtime=runtime, device=device, threads=threads)
+        return cls(loaded, record, config=config or DetectorConfig())
+
+    @property
+    def runtime(self) -> str:
+        """The backend that runs the network: ``torch`` or ``openvino``."""
+        return self._runtime.name
 
     def with_config(self, config: DetectorConfig) -> AnomalyDetector:
         """The same weights under another configuration; nothing is loaded or copied."""
-        return AnomalyDetector(self._network, self._record, config=config, device=self.device)
+        return AnomalyDetector(self._runtime, self._record, config=config)
 
     def detect(self, pair: FramePair, *, decode_ms: float = 0.0) -> Detection:
         """Judge one pair.
@@ -109,8 +118,10 @@ class AnomalyDetector:
         """``detect`` with its maps; same errors. The paper's algorithm on one screen."""
         started = time.perf_counter()
         model_input = prepare(pair, self._record.model)
-        prediction = self._predict(model_input)
-        reconstruction, inside = reconstruct(pair.target.image, prediction.target_coordinates)
+        focal_px = self._record.model.view.focal_px
+        predicted = predict_flow(self._runtime, model_input, self.config.correction, focal_px=focal_px)
+        coordinates = model_input.view.target_coordinates(predicted.flow_px, predicted.stride)
+        reconstruction, inside = reconstruct(pair.target.image, coordinates)
         if (analyzed := model_input.view.analyzed()) is not None:
             inside &= analyzed
         residual = photometric_residual(pair.source.image, reconstruction, inside)
@@ -145,20 +156,8 @@ class AnomalyDetector:
             residual=summary,
             timings_ms=timings_ms,
         )
-        flow_px = prediction.target_coordinates - pixel_grid(height, width)
-        return Analysis(detection, residual, reconstruction, flow_px, prediction.hypothesis)
-
-    def _predict(self, model_input: ModelInput) -> _Prediction:
-        """Where each source pixel went, by the hypothesis that reconstructs the source best."""
-        batch = collate([model_input], self.device)
-        autocast = torch.autocast("cuda", dtype=torch.bfloat16, enabled=torch.device(self.device).type == "cuda")
-        with torch.inference_mode(), autocast:
-            source = batch.source.contiguous(memory_format=torch.channels_last)
-            output = self._network(source, batch.motion, batch.interval_s)
-            output = output._replace(flow_px=output.flow_px.float())
-            winner = int(select_hypothesis(output, batch.source, batch.target)[0])
-            flow = output.flow_px[0, winner].permute(1, 2, 0).contiguous().cpu().numpy()
-        return _Prediction(model_input.view.target_coordinates(flow, output.stride), winner)
+        flow_px = coordinates - pixel_grid(height, width)
+        return Analysis(detection, residual, reconstruction, flow_px, predicted.hypothesis)
 
     def _judge_input(self, pair: FramePair, model_input: ModelInput) -> tuple[tuple[Reason, ...], bool]:
         """What lowers trust in this pair, and whether it must not be judged."""

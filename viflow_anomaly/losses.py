@@ -105,39 +105,16 @@ def photometric_loss(
 def photometric_error(
     flow_px: torch.Tensor, source: torch.Tensor, target: torch.Tensor, *, stride: int
 ) -> torch.Tensor:
-    """Charbonnier error [B] of one flow [B, 2, h, w], on its own grid and at twice its resolution."""
+    """Charbonnier error [B] of one flow [B, 2, h, w], on its own grid and on every doubled one down to the pixels."""
     source, target = _normalised(source), _normalised(target)
-    coarse = _charbonnier(F.avg_pool2d(source, stride), F.avg_pool2d(target, stride), flow_px / stride)
-    fine = stride // 2
-    fine_flow = F.interpolate(flow_px, scale_factor=2.0, mode="bilinear", align_corners=False) / fine
-    return coarse + _charbonnier(F.avg_pool2d(source, fine), F.avg_pool2d(target, fine), fine_flow)
-
-
-def select_hypothesis(output: ViflowOutput, source: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """The hypothesis whose reconstruction fits best, judged as in training on a coarse grid: [B] int64.
-
-    Args:
-        output: [B, K, 2, h, w] hypotheses.
-        source, target: [B, 1, H, W] in 0..1.
-    """
-    flow, stride = output.flow_px, output.stride
-    batch, hypotheses = flow.shape[:2]
-    if hypotheses == 1:
-        return torch.zeros(batch, dtype=torch.int64, device=flow.device)
-    shrink = max(stride, 4)
-    height, width = (side // shrink * shrink for side in source.shape[-2:])
-    level_flow = flow.flatten(0, 1) / shrink
-    if shrink != stride:
-        level_flow = F.avg_pool2d(level_flow, shrink // stride)
-    level_flow = level_flow[..., : height // shrink, : width // shrink]
-    level_source = F.avg_pool2d(_normalised(source[..., :height, :width]), shrink)
-    level_target = F.avg_pool2d(_normalised(target[..., :height, :width]), shrink)
-    errors = _charbonnier(
-        level_source.repeat_interleave(hypotheses, dim=0),
-        level_target.repeat_interleave(hypotheses, dim=0),
-        level_flow,
-    )
-    return errors.view(batch, -1).argmin(dim=1)
+    error = flow_px.new_zeros(len(flow_px))
+    while True:
+        level = (source, target) if stride == 1 else (F.avg_pool2d(source, stride), F.avg_pool2d(target, stride))
+        error = error + _charbonnier(*level, flow_px / stride)
+        if stride == 1:
+            return error
+        flow_px = F.interpolate(flow_px, scale_factor=2.0, mode="bilinear", align_corners=False)
+        stride //= 2
 
 
 def _normalised(image: torch.Tensor) -> torch.Tensor:

@@ -16,7 +16,7 @@ from typing import Any
 
 from pydantic import Field, PositiveInt
 
-from viflow_anomaly.config import DetectorConfig, FrozenConfig, ImageLimits, ModelConfig, TrainingConfig
+from viflow_anomaly.config import DetectorConfig, FrozenConfig, ImageLimits, ModelConfig, RuntimeName, TrainingConfig
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.simulator.config import SimulatorConfig
 
@@ -35,6 +35,7 @@ class Settings(FrozenConfig):
     checkpoint: Path | None = None
     device: str = "cpu"
     threads: PositiveInt = 1
+    runtime: RuntimeName = "auto"
     limits: ImageLimits = ImageLimits()
     detector: DetectorConfig = DetectorConfig()
     model: ModelConfig = ModelConfig()

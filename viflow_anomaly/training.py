@@ -17,12 +17,8 @@ from torch import nn
 
 from viflow_anomaly import __version__
 from viflow_anomaly.batch import Batch, require_device
-from viflow_anomaly.checkpoint import (
-    load_training_state,
-    save_checkpoint,
-    save_training_state,
-    source_commit,
-)
+from viflow_anomaly.checkpoint import load_training_state, save_checkpoint, save_training_state
+from viflow_anomaly.checkpoint_record import source_commit
 from viflow_anomaly.config import ModelConfig, TrainingConfig, loss_of_preset
 from viflow_anomaly.errors import CheckpointError, ConfigError
 from viflow_anomaly.evaluation.endpoint_error import EndpointErrors, measure_endpoint_errors, require_ground_truth
@@ -31,6 +27,7 @@ from viflow_anomaly.model.builder import build_model
 from viflow_anomaly.model.calibrated import CalibratedViflow
 from viflow_anomaly.model.outputs import ViflowOutput
 from viflow_anomaly.rigid_losses import corrected_loss
+from viflow_anomaly.runtime.torch_runtime import TorchRuntime
 from viflow_anomaly.training_data import TrainingData, load_training_data
 from viflow_anomaly.training_progress import TrainingProgress
 
@@ -57,7 +54,7 @@ class TrainingRun:
         batch = data.sample(
             seed=self.config.seed, step=self.step, batch_size=self.config.batch_size, device=self.device
         )
-        source = batch.source.contiguous(memory_format=torch.channels_last)
+        source = self._relit(batch.source).contiguous(memory_format=torch.channels_last)
         with torch.autocast(torch.device(self.device).type, dtype=torch.bfloat16, enabled=self.config.autocast):
             output = self.network(source, batch.motion, batch.interval_s)
         output = output._replace(flow_px=output.flow_px.float())
@@ -68,6 +65,19 @@ class TrainingRun:
         self.optimizer.step()
         self.step += 1
         return float(loss.detach()), torch.bincount(winners, minlength=self.model_config.hypotheses)
+
+    def _relit(self, source: torch.Tensor) -> torch.Tensor:
+        """What the network is shown: another exposure, contrast and noise than the loss sees, a function of the step."""
+        strength = self.config.relighting
+        if not strength:
+            return source
+        generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
+        shape = (len(source), 1, 1, 1)
+        gain, offset, noise = (torch.rand(shape, generator=generator) for _ in range(3))
+        grain = torch.randn(source.shape, generator=generator) * (0.04 * strength * noise)
+        gain, offset = 1 + strength * (gain - 0.5), strength * 0.4 * (offset - 0.5)
+        relit = (source - 0.5) * gain.to(source.device) + 0.5 + (offset + grain).to(source.device)
+        return relit.clamp(0, 1)
 
     def _loss(self, output: ViflowOutput, batch: Batch) -> LossResult:
         relaxation = self.config.relaxation
@@ -252,8 +262,7 @@ def _provenance_metrics(errors: EndpointErrors | None) -> dict[str, Any]:
 
 def _validate(run: TrainingRun, validation: Sequence[Path]) -> EndpointErrors:
     run.network.eval()
-    errors = measure_endpoint_errors(
-        run.network, run.model_config, validation, max_pairs=run.config.validation_pairs, device=run.device
-    )
+    runtime = TorchRuntime(run.network, device=run.device)
+    errors = measure_endpoint_errors(runtime, run.model_config, validation, max_pairs=run.config.validation_pairs)
     run.network.train()
     return errors

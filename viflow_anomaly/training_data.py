@@ -55,7 +55,7 @@ class PairBucket:
         confidence = self.confidence[index].astype(np.float32) / 255
         if mirrored:
             flow, confidence = flow[:, ::-1] * np.float32((-1, 1)), confidence[:, ::-1]
-        return MeasuredFlow(flow, confidence)
+        return MeasuredFlow(flow, confidence, FLOW_STRIDE)
 
 
 @dataclass(frozen=True, eq=False)

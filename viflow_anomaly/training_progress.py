@@ -11,7 +11,7 @@ from typing import Any, Self
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from viflow_anomaly.checkpoint import write_atomically
+from viflow_anomaly.checkpoint_record import write_atomically
 
 LOG_EVERY = 50
 

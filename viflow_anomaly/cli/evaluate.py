@@ -19,13 +19,12 @@ from viflow_anomaly.cli.options import (
     ConfigFile,
     Device,
     Threads,
-    limit_threads,
     settings_from,
 )
 from viflow_anomaly.cli.progress import stderr_progress
 
 if TYPE_CHECKING:
-    from viflow_anomaly.checkpoint import CheckpointRecord
+    from viflow_anomaly.checkpoint_record import CheckpointRecord
     from viflow_anomaly.evaluation.endpoint_error import EndpointErrors
 
 
@@ -46,7 +45,8 @@ def flow(
 ) -> None:
     """Measure the endpoint error of the predicted flow, beside that of predicting no motion at all.
 
-    Errors are means over pairs, in pixels of the source image, on the static world. A sequence belongs to the group
+    Errors are means over pairs, in pixels of the source image, on the static world: after the correction on the target
+    image, as the detector uses it, and as the network predicted it. A sequence belongs to the group
     that its name gives up to the first underscore (`drone_000007`: drone).
 
     [bold]Examples[/bold]
@@ -57,22 +57,26 @@ def flow(
     """
     options = {"checkpoint": checkpoint, "threads": threads, "device": device}
     settings = settings_from(config, assignments, options)
-    limit_threads(settings.threads)
-    from viflow_anomaly.batch import require_device
-    from viflow_anomaly.checkpoint import load_checkpoint, write_atomically
+    import cv2
+
+    from viflow_anomaly.checkpoint_record import write_atomically
     from viflow_anomaly.evaluation.endpoint_error import measure_endpoint_errors, require_ground_truth
 
-    require_device(settings.device)
-    model, record = load_checkpoint(settings.checkpoint)
+    from viflow_anomaly.runtime.loading import load_runtime
+
+    cv2.setNumThreads(settings.threads)
+    runtime, record = load_runtime(
+        settings.checkpoint, runtime=settings.runtime, device=settings.device, threads=settings.threads
+    )
     require_ground_truth(recordings)
     with stderr_progress() as progress:
         task = progress.add_task("pairs", total=None)
         errors = measure_endpoint_errors(
-            model.to(settings.device),
+            runtime,
             record.model,
             recordings,
+            correction=settings.detector.correction,
             max_pairs=max_pairs,
-            device=settings.device,
             on_progress=lambda done, total: progress.update(task, completed=done, total=total),
         )
     text = json.dumps(_report(errors, record), indent=2, ensure_ascii=False, allow_nan=False)
@@ -81,8 +85,11 @@ def flow(
     print(text) if as_json else _print_table(errors, record)
 
 
+SHOWN = ("epe_px", "predicted_epe_px", "identity_epe_px", "epe_ratio", "predicted_epe_ratio")
+
+
 def _report(errors: EndpointErrors, record: CheckpointRecord) -> dict[str, Any]:
-    from viflow_anomaly.checkpoint import source_commit
+    from viflow_anomaly.checkpoint_record import source_commit
 
     return {
         "model": {"name": record.name, "version": record.version, "sha256": record.sha256},
@@ -96,10 +103,9 @@ def _report(errors: EndpointErrors, record: CheckpointRecord) -> dict[str, Any]:
 
 
 def _measures(errors: EndpointErrors) -> dict[str, float | int | None]:
-    """The summary with the number of pairs; the ratio to an identity error of 0 is null."""
-    summary = errors.summary()
-    ratio = summary["epe_ratio"]
-    return {**summary, "epe_ratio": None if math.isnan(ratio) else ratio, "pairs": len(errors.pairs)}
+    """The summary with the number of pairs; a ratio to an identity error of 0 is null."""
+    summary = {name: None if math.isnan(value) else value for name, value in errors.summary().items()}
+    return {**summary, "pairs": len(errors.pairs)}
 
 
 def _cpu_model() -> str:
@@ -117,13 +123,13 @@ def _print_table(errors: EndpointErrors, record: CheckpointRecord) -> None:
     from rich.markup import escape
     from rich.table import Column, Table
 
-    columns = [Column(name, justify="right") for name in ("pairs", "EPE px", "identity EPE px", "ratio")]
+    columns = [Column(name, justify="right") for name in ("pairs", "EPE px", "predicted", "identity", "ratio", "predicted")]
     table = Table(Column("sequence", no_wrap=True), *columns, box=SIMPLE)
     parts = [errors.per_sequence(), errors.per_group(), {"all": errors}]
     for part in parts:
         for name, some in part.items():
             measures = some.summary()
-            numbers = (f"{measures[key]:.3f}" for key in ("epe_px", "identity_epe_px", "epe_ratio"))
+            numbers = (f"{measures[key]:.3f}" for key in SHOWN)
             table.add_row(escape(name), str(len(some.pairs)), *numbers)
         table.add_section()
     console = Console()

@@ -46,22 +46,21 @@ def settings_from(
     return resolve_settings(config_file=config, environment=os.environ, assignments=assignments or (), options=options)
 
 
-def limit_threads(threads: int) -> None:
-    """Give torch and OpenCV this many CPU threads."""
-    import cv2
-    import torch
-
-    torch.set_num_threads(threads)
-    cv2.setNumThreads(threads)
-
-
 def load_detector(settings: Settings) -> AnomalyDetector:
     """The detector that the settings describe, with its threads limited.
 
     Raises:
         CheckpointError: a checkpoint that cannot be used.
     """
-    limit_threads(settings.threads)
+    import cv2
+
     from viflow_anomaly.detector import AnomalyDetector
 
-    return AnomalyDetector.from_checkpoint(settings.checkpoint, config=settings.detector, device=settings.device)
+    cv2.setNumThreads(settings.threads)
+    return AnomalyDetector.from_checkpoint(
+        settings.checkpoint,
+        config=settings.detector,
+        device=settings.device,
+        runtime=settings.runtime,
+        threads=settings.threads,
+    )

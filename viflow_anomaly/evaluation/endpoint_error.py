@@ -1,7 +1,8 @@
 """Endpoint error of predicted flow against ground truth, beside the identity's (no motion at all).
 
-Measured in source-image pixels over every pixel with ground truth, on the hypothesis that reconstructs the source
-best (the choice needs no ground truth).
+Measured in source-image pixels over every pixel with ground truth, twice: on the hypothesis that reconstructs the
+source best, as the network predicted it (the paper's method; the choice needs no ground truth), and after the
+correction on the target image, as the detector uses it.
 """
 
 from __future__ import annotations
@@ -9,30 +10,29 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
-from torch import nn
 
-from viflow_anomaly.batch import collate, prepare
-from viflow_anomaly.config import ModelConfig
+from viflow_anomaly.config import CorrectionConfig, ModelConfig
 from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.datasets.registry import open_recording
 from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.geometry import Float32Array, pixel_grid
-from viflow_anomaly.losses import select_hypothesis
-from viflow_anomaly.sensor_data import FramePair
+from viflow_anomaly.model_input import prepare
+from viflow_anomaly.prediction import predict_flow
+from viflow_anomaly.runtime.interface import Runtime
 
 
 @dataclass(frozen=True)
 class PairError:
-    """One pair: mean endpoint errors in pixels of the prediction and of the identity, and the winning hypothesis."""
+    """One pair: mean endpoint errors in pixels of the flow that the detector uses, of the winning hypothesis as it was
+    predicted, and of the identity; and which hypothesis won."""
 
     sequence: str
     source_timestamp_ns: int
     epe_px: float
+    predicted_epe_px: float
     identity_epe_px: float
     hypothesis: int
 
@@ -44,11 +44,19 @@ class EndpointErrors:
     pairs: tuple[PairError, ...] = field(default=())
 
     def summary(self) -> dict[str, float]:
-        """Means over pairs, and their ratio."""
-        epe = float(np.mean([pair.epe_px for pair in self.pairs]))
-        identity = float(np.mean([pair.identity_epe_px for pair in self.pairs]))
-        ratio = epe / identity if identity else float("nan")
-        return {"epe_px": round(epe, 4), "identity_epe_px": round(identity, 4), "epe_ratio": round(ratio, 4)}
+        """Means over pairs, and their ratios to the identity's."""
+        epe, predicted, identity = (
+            float(np.mean([getattr(pair, name) for pair in self.pairs]))
+            for name in ("epe_px", "predicted_epe_px", "identity_epe_px")
+        )
+        ratio, predicted_ratio = (one / identity if identity else float("nan") for one in (epe, predicted))
+        return {
+            "epe_px": round(epe, 4),
+            "predicted_epe_px": round(predicted, 4),
+            "identity_epe_px": round(identity, 4),
+            "epe_ratio": round(ratio, 4),
+            "predicted_epe_ratio": round(predicted_ratio, 4),
+        }
 
     def per_sequence(self) -> dict[str, EndpointErrors]:
         """The errors of each sequence, by its name."""
@@ -63,31 +71,21 @@ class EndpointErrors:
         return {name: EndpointErrors(tuple(pair for pair in self.pairs if key(pair) == name)) for name in names}
 
 
-def predict_flow(network: nn.Module, config: ModelConfig, pair: FramePair, *, device: str) -> tuple[Float32Array, int]:
-    """The winning hypothesis as flow [H, W, 2] in source pixels, and its index."""
-    prepared = prepare(pair, config)
-    batch = collate([prepared], device)
-    with torch.inference_mode():
-        output = network(batch.source, batch.motion, batch.interval_s)
-        winner = int(select_hypothesis(output, batch.source, batch.target)[0])
-        flow = output.flow_px[0, winner].permute(1, 2, 0).float().cpu().contiguous().numpy()
-    height, width = pair.source.image.shape
-    return prepared.view.target_coordinates(flow, output.stride) - pixel_grid(height, width), winner
-
-
 def measure_endpoint_errors(
-    network: nn.Module,
+    runtime: Runtime,
     config: ModelConfig,
     recordings: Sequence[Path],
     *,
+    correction: CorrectionConfig | None = None,
     max_pairs: int | None = None,
-    device: str = "cpu",
     on_progress: Callable[[int, int], None] | None = None,
 ) -> EndpointErrors:
     """Errors against simulated static flow, adjacent frames.
 
     Args:
-        network: in evaluation mode.
+        runtime: of the network.
+        config: what its input looks like.
+        correction: None: its defaults.
         recordings: simulated sequences with ground truth.
         max_pairs: evenly spread over all pairs (None: all).
         on_progress: called with (done, total) after each pair.
@@ -104,7 +102,7 @@ def measure_endpoint_errors(
         opened = [opened[k] for k in np.linspace(0, len(opened) - 1, max_pairs).round().astype(int)]
     errors = []
     for done, one in enumerate(opened, start=1):
-        errors.append(_pair_error(network, config, *one, device=device))
+        errors.append(_pair_error(runtime, config, *one, correction or CorrectionConfig()))
         if on_progress is not None:
             on_progress(done, len(opened))
     return EndpointErrors(tuple(errors))
@@ -136,16 +134,16 @@ def _open_with_ground_truth(path: Path) -> tuple[RecordingPairs, SimulatedGround
 
 
 def _pair_error(
-    network: nn.Module,
+    runtime: Runtime,
     config: ModelConfig,
     pairs: RecordingPairs,
     truth: SimulatedGroundTruth,
     index: int,
-    *,
-    device: str,
+    correction: CorrectionConfig,
 ) -> PairError:
     pair = pairs[index]
-    predicted, winner = predict_flow(network, config, pair, device=device)
+    model_input = prepare(pair, config)
+    predicted = predict_flow(runtime, model_input, correction, focal_px=config.view.focal_px)
     flow, valid = truth.static_flow(pair.source.timestamp_ns, pair.target.timestamp_ns)
     if not valid.any():
         raise DatasetError(
@@ -153,11 +151,17 @@ def _pair_error(
             code="ground_truth_missing",
             field="validation",
         )
-    difference: Any = np.linalg.norm(predicted - flow, axis=-1)[valid]
+
+    def epe(flow_view_px: Float32Array) -> float:
+        target = model_input.view.target_coordinates(flow_view_px, predicted.stride)
+        difference = target - pixel_grid(*flow.shape[:2]) - flow
+        return float(np.linalg.norm(difference, axis=-1)[valid].mean())
+
     return PairError(
         sequence=pairs.recording.name,
         source_timestamp_ns=pair.source.timestamp_ns,
-        epe_px=float(difference.mean()),
+        epe_px=epe(predicted.flow_px),
+        predicted_epe_px=epe(predicted.hypothesis_px),
         identity_epe_px=float(np.linalg.norm(flow, axis=-1)[valid].mean()),
-        hypothesis=winner,
+        hypothesis=predicted.hypothesis,
     )

@@ -1,0 +1,138 @@
+"""The JSON beside a checkpoint's tensors: configuration, checksum, provenance. Read without torch."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from viflow_anomaly.config import FrozenConfig, ModelConfig
+from viflow_anomaly.errors import CheckpointError, ConfigError
+
+FORMAT_VERSION = 1
+BUNDLED_NAME = "viflow-compact"
+MAX_RECORD_BYTES = 4 * 1024 * 1024
+
+
+class CheckpointRecord(FrozenConfig):
+    """The JSON beside the tensors.
+
+    Attributes:
+        format_version: of this layout; another one is refused.
+        name, version: of the model.
+        sha256: of the tensor file.
+        model: what the builder needs.
+        provenance: commit, training configuration, data, metrics; free-form, for people.
+    """
+
+    format_version: Literal[1] = 1
+    name: str = Field(min_length=1)
+    version: str = Field(min_length=1)
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    model: ModelConfig
+    provenance: dict[str, Any] = Field(default_factory=dict)
+
+
+def bundled_checkpoint() -> Path:
+    """The tensor file of the model that ships with the package."""
+    return Path(str(resources.files("viflow_anomaly.weights"))) / f"{BUNDLED_NAME}.safetensors"
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write beside ``path`` and rename, so that nobody ever sees half a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes(data)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_checkpoint(path: Path) -> tuple[bytes, CheckpointRecord]:
+    """The tensor file's bytes and its record; the checksum is compared, nothing is executed.
+
+    Raises:
+        CheckpointError: ``checkpoint_missing``, ``checkpoint_not_safetensors`` (a pickle, or anything else),
+            ``checkpoint_record_invalid``, ``checkpoint_version``, ``checkpoint_corrupt`` (truncated or altered).
+    """
+    if path.suffix != ".safetensors":
+        raise CheckpointError(
+            f"{path}: expected a .safetensors file with its .json beside it; pickled checkpoints (.pt, .pth, .ckpt) "
+            "can run code and are not read",
+            code="checkpoint_not_safetensors",
+            field="checkpoint",
+        )
+    data = read_checkpoint_file(path)
+    record = _read_record(path)
+    found = hashlib.sha256(data).hexdigest()
+    if found != record.sha256:
+        raise corrupt_checkpoint(path, f"expected sha256 {record.sha256}, found {found} over {len(data)} bytes")
+    return data, record
+
+
+def read_checkpoint_file(path: Path) -> bytes:
+    """The bytes of one file of a checkpoint; ``checkpoint_missing`` where there are none."""
+    try:
+        return path.read_bytes()
+    except OSError as err:
+        raise CheckpointError(
+            f"{path}: expected a readable checkpoint file, found: {err.strerror}",
+            code="checkpoint_missing",
+            field="checkpoint",
+        ) from err
+
+
+def _read_record(path: Path) -> CheckpointRecord:
+    record_path = path.with_suffix(".json")
+    if not record_path.exists():
+        raise CheckpointError(
+            f"{path}: expected a checkpoint of this package, tensors with {record_path} beside them, "
+            "found no such file (others, pickles among them, are not read)",
+            code="checkpoint_missing",
+            field="checkpoint",
+        )
+    data = read_checkpoint_file(record_path)
+    if len(data) > MAX_RECORD_BYTES:
+        raise invalid_record(record_path, f"expected at most {MAX_RECORD_BYTES} bytes, found {len(data)}")
+    try:
+        values = json.loads(data)
+    except (ValueError, RecursionError) as err:
+        raise invalid_record(record_path, f"expected JSON, found: {err}") from err
+    version = values.get("format_version") if isinstance(values, dict) else None
+    if version is not None and version != FORMAT_VERSION:
+        raise CheckpointError(
+            f"{record_path}: expected format_version {FORMAT_VERSION}, found {version!r}",
+            code="checkpoint_version",
+            field="checkpoint",
+        )
+    try:
+        return CheckpointRecord.from_mapping(values, where=str(record_path))
+    except ConfigError as err:
+        raise CheckpointError(err.message, code="checkpoint_record_invalid", field="checkpoint") from err
+
+
+def invalid_record(record_path: Path, problem: str) -> CheckpointError:
+    """The error of a record that does not say what it must."""
+    return CheckpointError(f"{record_path}: {problem}", code="checkpoint_record_invalid", field="checkpoint")
+
+
+def corrupt_checkpoint(path: Path, problem: str) -> CheckpointError:
+    """The error of a file that is not what its record says."""
+    return CheckpointError(f"{path}: truncated or altered: {problem}", code="checkpoint_corrupt", field="checkpoint")
+
+
+def source_commit() -> str | None:
+    """The commit of the source tree this package runs from, or None (an installed wheel)."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    try:
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True)  # noqa: S603
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return answer.stdout.strip()

@@ -1,0 +1,38 @@
+"""A frame pair as every network and runtime wants it: two views and a motion window, still numpy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from viflow_anomaly.config import ModelConfig
+from viflow_anomaly.motion_input import MotionWindow, build_motion_window
+from viflow_anomaly.sensor_data import FramePair, Uint8Array
+from viflow_anomaly.view import InternalView, make_view
+
+
+@dataclass(frozen=True, eq=False)
+class ModelInput:
+    """One pair.
+
+    Attributes:
+        source, target: [h, w] uint8 views.
+        window: its ``values`` are [T, 6].
+        view: how the views came from the source image.
+    """
+
+    source: Uint8Array
+    target: Uint8Array
+    window: MotionWindow
+    view: InternalView
+
+
+def prepare(pair: FramePair, config: ModelConfig) -> ModelInput:
+    """Render the views of a pair and build its motion window.
+
+    Raises:
+        InvalidInputError: as ``make_view`` and ``build_motion_window``.
+    """
+    height, width = pair.source.image.shape
+    view = make_view(config.view, width=width, height=height, camera=pair.camera)
+    window = build_motion_window(pair, config.motion_window)
+    return ModelInput(view.render(pair.source.image), view.render(pair.target.image), window, view)

@@ -1,0 +1,137 @@
+"""From a network's hypotheses to one flow: choose what explains the target image best, then correct it there."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from viflow_anomaly.config import CorrectionConfig
+from viflow_anomaly.correction import Correction, correct_flow, correct_motion
+from viflow_anomaly.geometry import Float32Array, pixel_grid
+from viflow_anomaly.measured_flow import MeasuredFlow, measure_flow
+from viflow_anomaly.model_input import ModelInput
+from viflow_anomaly.runtime.interface import Hypotheses, Runtime
+from viflow_anomaly.sensor_data import Uint8Array
+
+SELECTION_STRIDE_PX = 4
+"""Hypotheses compete on pictures shrunk this far, as in training."""
+CHARBONNIER_EPSILON = 0.01
+
+
+class PredictedFlow(NamedTuple):
+    """Where the static world goes.
+
+    Attributes:
+        flow_px: [h, w, 2] float32 in view pixels, on cells of ``stride``.
+        stride: view pixels for one cell.
+        hypothesis: the winner.
+        hypothesis_px: [h, w, 2] its flow as the network predicted it.
+        correction: what the target image changed, None with correction off.
+        measured: what the correction was made with.
+    """
+
+    flow_px: Float32Array
+    stride: int
+    hypothesis: int
+    hypothesis_px: Float32Array
+    correction: Correction | None
+    measured: MeasuredFlow | None
+
+
+def predict_flow(
+    runtime: Runtime, model_input: ModelInput, config: CorrectionConfig, *, focal_px: float
+) -> PredictedFlow:
+    """The flow of the static world in one view.
+
+    Args:
+        runtime: of the network.
+        model_input: the pair.
+        config: of the correction; off, the winner stands as the network predicted it (the paper's method).
+        focal_px: of the view.
+    """
+    return correct(runtime.predict(model_input), model_input, config, focal_px=focal_px)
+
+
+def correct(
+    hypotheses: Hypotheses, model_input: ModelInput, config: CorrectionConfig, *, focal_px: float
+) -> PredictedFlow:
+    """Choose a hypothesis and correct it; arguments as in ``predict_flow``."""
+    winner = choose_hypothesis(hypotheses, model_input.source, model_input.target)
+    predicted, stride = hypotheses.flow_px[winner], hypotheses.stride
+    if not config.enabled:
+        return PredictedFlow(predicted, stride, winner, predicted, None, None)
+    measured = measure_flow(model_input.source, model_input.target, stride=stride)
+    rays = view_rays(*predicted.shape[:2], stride, *model_input.source.shape, focal_px)
+    if hypotheses.scene is None:
+        correction = correct_flow(rays, hypotheses.flow_px, winner, measured, focal_px, config)
+    else:
+        scene = hypotheses.scene
+        correction = correct_motion(rays, scene.inverse_depth, scene.motion(winner), measured, focal_px, config)
+    return PredictedFlow(correction.flow_px, stride, winner, predicted, correction, measured)
+
+
+@lru_cache(maxsize=16)
+def view_rays(rows: int, columns: int, stride: int, height: int, width: int, focal_px: float) -> Float32Array:
+    """[rows, columns, 2]: (x, y) of each cell from the middle of a height x width view, in focal lengths."""
+    middle = ((width - 1) / 2, (height - 1) / 2)
+    cells = (pixel_grid(rows, columns) + np.float32(0.5)) * np.float32(stride) - np.float32(0.5)
+    rays = np.asarray((cells - middle) / focal_px, dtype=np.float32)
+    rays.setflags(write=False)
+    return rays
+
+
+def choose_hypothesis(hypotheses: Hypotheses, source: Uint8Array, target: Uint8Array) -> int:
+    """The hypothesis whose reconstruction of the source fits best [Approach], judged as in training on a coarse grid.
+
+    A pixel whose prediction leaves the target costs what it would had nothing moved, so leaving never pays.
+    """
+    flow_px, stride = hypotheses.flow_px, hypotheses.stride
+    if len(flow_px) == 1:
+        return 0
+    shrink = max(stride, SELECTION_STRIDE_PX)
+    size = (source.shape[1] // shrink, source.shape[0] // shrink)
+    small_source, small_target = (_normalised(image, size, shrink) for image in (source, target))
+    unmoved = _charbonnier(small_target, small_source)
+    grid = pixel_grid(size[1], size[0])
+    errors = [
+        _reconstruction_error(_shrunk(one, size, shrink // stride), grid, small_source, small_target, unmoved, shrink)
+        for one in flow_px
+    ]
+    return int(np.argmin(errors))
+
+
+def _normalised(image: Uint8Array, size: tuple[int, int], shrink: int) -> Float32Array:
+    """Mean 0 and deviation 1, so that a change of exposure costs nothing; then shrunk by averaging."""
+    whole = image[: size[1] * shrink, : size[0] * shrink]
+    mean, deviation = cv2.meanStdDev(whole)
+    small = cv2.resize(whole, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    return np.asarray((small - np.float32(mean[0, 0])) / np.float32(deviation[0, 0] + 0.02 * 255), dtype=np.float32)
+
+
+def _shrunk(flow_px: Float32Array, size: tuple[int, int], factor: int) -> Float32Array:
+    whole = flow_px[: size[1] * factor, : size[0] * factor]
+    return whole if factor == 1 else np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _charbonnier(first: Float32Array, second: Float32Array) -> Float32Array:
+    return np.sqrt(np.square(first - second) + np.float32(CHARBONNIER_EPSILON**2))
+
+
+def _reconstruction_error(
+    flow_px: Float32Array,
+    grid: Float32Array,
+    source: Float32Array,
+    target: Float32Array,
+    unmoved: Float32Array,
+    shrink: int,
+) -> float:
+    at = grid + flow_px / np.float32(shrink)
+    height, width = source.shape
+    inside = cv2.inRange(at, (0.0, 0.0), (width - 1.0, height - 1.0)) != 0
+    sampled = cv2.remap(  # type: ignore[call-overload]  # the stubs lack the two-channel map
+        target, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return float(np.where(inside, _charbonnier(sampled, source), unmoved).mean())

@@ -1,0 +1,1 @@
+"""Backends that run a network: one small interface, numpy in and numpy out."""

@@ -1,0 +1,106 @@
+"""A checkpoint as an ONNX file beside it, for OpenVINO, ONNX Runtime and other programs."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from viflow_anomaly.checkpoint import load_checkpoint
+from viflow_anomaly.checkpoint_record import write_atomically
+from viflow_anomaly.errors import ConfigError
+from viflow_anomaly.model.outputs import ViflowOutput
+from viflow_anomaly.runtime import exported
+
+OPSET = 20
+SIDE_MULTIPLE_PX = 32
+
+
+class _Tensors(nn.Module):
+    """The network with a flat tuple of outputs, as ONNX wants it."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(
+        self, source: torch.Tensor, motion: torch.Tensor, interval_s: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        output: ViflowOutput = self.network(source, motion, interval_s)
+        return (output.flow_px,) if output.scene is None else (output.flow_px, *output.scene)
+
+
+def export_onnx(path: Path | None, out: Path | None = None) -> Path:
+    """Write ``NAME.onnx`` for any view size whose sides are multiples of 32; weights in float32.
+
+    Args:
+        path: the checkpoint (None: the bundled one).
+        out: where to (None: beside the checkpoint, where the detector looks for it).
+
+    Raises:
+        CheckpointError: as ``load_checkpoint``.
+        ConfigError: ``export_unavailable``: the packages onnx and onnxscript are missing.
+    """
+    try:
+        import onnx  # noqa: PLC0415  # an extra
+        import onnxscript  # noqa: F401, PLC0415
+    except ImportError as err:
+        raise ConfigError(
+            "export: expected the packages onnx and onnxscript, found them missing: "
+            "pip install 'viflow-anomaly[export]'",
+            code="export_unavailable",
+        ) from err
+    network, record = load_checkpoint(path)
+    source, motion, interval_s = _example(record.model.motion_window.rows, record.model.view)
+    stride = network(source, motion, interval_s).stride
+    program = _traced(network, (source, motion, interval_s), fixed=record.model.preset == "paper")
+    with tempfile.TemporaryDirectory() as folder:
+        whole = Path(folder) / "network.onnx"
+        program.save(str(whole))
+        model = onnx.load(str(whole))
+    metadata = {
+        exported.NAME_KEY: record.name,
+        exported.VERSION_KEY: record.version,
+        exported.WEIGHTS_KEY: record.sha256,
+        exported.MODEL_KEY: record.model.model_dump_json(),
+        exported.FLOW_STRIDE_KEY: str(stride),
+    }
+    del model.metadata_props[:]
+    onnx.helper.set_model_props(model, metadata)
+    from viflow_anomaly.checkpoint_record import bundled_checkpoint  # noqa: PLC0415
+
+    out = out or (path or bundled_checkpoint()).with_suffix(".onnx")
+    write_atomically(out, model.SerializeToString(deterministic=True))
+    return out
+
+
+def _example(rows: int, view: Any) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    side = (view.crop_size, view.crop_size) if view.mode == "center_crop" else (224, 320)
+    return torch.rand(1, 1, *side), torch.zeros(1, rows, 6), torch.full((1,), 0.05)
+
+
+def _traced(network: nn.Module, inputs: tuple[torch.Tensor, ...], *, fixed: bool) -> Any:
+    shapes: Any = None
+    if not fixed:
+        height, width = torch.export.Dim("rows", min=1, max=256), torch.export.Dim("columns", min=1, max=256)
+        shapes = ({2: SIDE_MULTIPLE_PX * height, 3: SIDE_MULTIPLE_PX * width}, {}, {})
+    scene = network(*inputs).scene is not None
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()), torch.no_grad():
+        warnings.simplefilter("ignore")  # the exporter's own deprecations; what it makes is compared in the tests
+        return torch.onnx.export(
+            _Tensors(network).eval(),
+            inputs,
+            dynamo=True,
+            opset_version=OPSET,
+            input_names=list(exported.INPUT_NAMES),
+            output_names=list(exported.SCENE_OUTPUTS if scene else exported.FLOW_OUTPUTS),
+            dynamic_shapes=shapes,
+            verbose=False,
+            external_data=False,
+        )

@@ -1,0 +1,52 @@
+"""What every runtime answers, and how one is asked. No backend is imported here."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+from viflow_anomaly.correction import RigidMotion
+from viflow_anomaly.geometry import Float32Array, Float64Array
+from viflow_anomaly.model_input import ModelInput
+
+
+class Scene(NamedTuple):
+    """What a calibrated network says of the static world and the camera.
+
+    Attributes:
+        inverse_depth: [h, w] float32, 1/m.
+        rotation: [3, 3], maps source-camera to target-camera coordinates.
+        translations_m: [K, 3], one for each hypothesis.
+    """
+
+    inverse_depth: Float32Array
+    rotation: Float64Array
+    translations_m: Float64Array
+
+    def motion(self, hypothesis: int) -> RigidMotion:
+        """The camera motion of one hypothesis."""
+        return RigidMotion(self.rotation, self.translations_m[hypothesis])
+
+
+class Hypotheses(NamedTuple):
+    """A network's answer to one pair.
+
+    Attributes:
+        flow_px: [K, h, w, 2] float32 in view pixels; cells as in ``ViflowOutput``.
+        stride: view pixels for one cell.
+        scene: where the network knows it (preset ``calibrated``).
+    """
+
+    flow_px: Float32Array
+    stride: int
+    scene: Scene | None
+
+
+class Runtime(Protocol):
+    """Runs one network. Holds weights only, so that threads may share it."""
+
+    @property
+    def name(self) -> str:
+        """``torch`` or ``openvino``."""
+
+    def predict(self, model_input: ModelInput) -> Hypotheses:
+        """All hypotheses of one pair."""

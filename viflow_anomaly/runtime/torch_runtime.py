@@ -1,0 +1,40 @@
+"""The reference runtime: PyTorch on any of its devices."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import nn
+
+from viflow_anomaly.batch import collate
+from viflow_anomaly.model_input import ModelInput
+from viflow_anomaly.runtime.interface import Hypotheses, Scene
+
+
+class TorchRuntime:
+    """A network in evaluation mode.
+
+    Args:
+        network: of this package; moved to ``device``.
+        device: torch device name.
+    """
+
+    name = "torch"
+
+    def __init__(self, network: nn.Module, *, device: str = "cpu") -> None:
+        self._device = device
+        self._network: nn.Module = network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def predict(self, model_input: ModelInput) -> Hypotheses:
+        """All hypotheses of one pair."""
+        batch = collate([model_input], self._device)
+        cuda = torch.device(self._device).type == "cuda"
+        with torch.inference_mode(), torch.autocast("cuda", dtype=torch.bfloat16, enabled=cuda):
+            source = batch.source.contiguous(memory_format=torch.channels_last)
+            output = self._network(source, batch.motion, batch.interval_s)
+        scene = None
+        if output.scene is not None:
+            inverse_depth, rotation, translation_m = (one[0].float().cpu().numpy() for one in output.scene)
+            scene = Scene(inverse_depth[0], rotation.astype(np.float64), translation_m.astype(np.float64))
+        flow_px = output.flow_px[0].permute(0, 2, 3, 1).float().cpu().contiguous().numpy()
+        return Hypotheses(flow_px, output.stride, scene)
