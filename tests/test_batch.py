@@ -7,9 +7,10 @@ import pytest
 import torch
 from worlds import World, make_world
 
-from viflow_anomaly.batch import collate, collate_arrays, prepare
+from viflow_anomaly.batch import collate, collate_arrays
 from viflow_anomaly.config import ModelConfig, ViewConfig
 from viflow_anomaly.errors import InvalidInputError
+from viflow_anomaly.model_input import prepare
 from viflow_anomaly.motion_input import build_motion_window
 from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples
 
@@ -38,7 +39,7 @@ def test_collate_keeps_the_order_and_scales_the_images() -> None:
     height, width = inputs[0].source.shape
     assert batch.source.shape == batch.target.shape == (2, 1, height, width)
     assert batch.motion.shape == (2, CONFIG.motion_window.rows, 6)
-    assert {tensor.dtype for tensor in batch} == {torch.float32}
+    assert {tensor.dtype for tensor in batch[:4]} == {torch.float32}
     for index, one in enumerate(inputs):
         np.testing.assert_allclose(batch.source[index, 0].numpy() * 255, one.source, atol=1e-4)
         np.testing.assert_allclose(batch.target[index, 0].numpy() * 255, one.target, atol=1e-4)
@@ -50,7 +51,7 @@ def test_collate_keeps_the_order_and_scales_the_images() -> None:
 
 def test_the_batch_goes_to_the_device_that_is_asked_for() -> None:
     batch = collate([prepare(pair_of(make_world(), 0, 1), CONFIG)], "meta")
-    assert {tensor.device.type for tensor in batch} == {"meta"}
+    assert {tensor.device.type for tensor in batch[:4]} == {"meta"}
 
 
 def test_arrays_and_inputs_make_the_same_batch() -> None:
@@ -58,7 +59,7 @@ def test_arrays_and_inputs_make_the_same_batch() -> None:
     batch = collate([one])
     interval_s = np.array([one.window.interval_s], dtype=np.float32)
     same = collate_arrays(one.source[None], one.target[None], one.window.values[None].copy(), interval_s)
-    assert all(torch.equal(a, b) for a, b in zip(batch, same, strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(batch[:4], same[:4], strict=True))
 
 
 def test_an_image_that_the_view_cannot_take_is_refused() -> None:

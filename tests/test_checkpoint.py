@@ -12,14 +12,11 @@ from safetensors.torch import save as save_tensors
 from torch import nn
 
 from viflow_anomaly import checkpoint as checkpoint_module
-from viflow_anomaly.checkpoint import (
+from viflow_anomaly.checkpoint import load_checkpoint, load_training_state, save_checkpoint, save_training_state
+from viflow_anomaly.checkpoint_record import (
     MAX_RECORD_BYTES,
     CheckpointRecord,
     bundled_checkpoint,
-    load_checkpoint,
-    load_training_state,
-    save_checkpoint,
-    save_training_state,
     source_commit,
     write_atomically,
 )

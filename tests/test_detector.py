@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from viflow_anomaly.checkpoint import load_checkpoint, save_checkpoint
-from viflow_anomaly.config import DetectorConfig, ModelConfig, ViewConfig
+from viflow_anomaly.config import CorrectionConfig, DetectorConfig, ModelConfig, ViewConfig
 from viflow_anomaly.detection import load_detection_schema, to_json, to_json_dict
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import ConfigError, InvalidInputError
@@ -55,7 +55,9 @@ def turned(image: Uint8Array, rate: tuple[float, float, float]) -> Uint8Array:
     rotation = so3_exp(np.array(rate) * INTERVAL_NS * 1e-9)
     matrix = np.array([[FOCAL_PX, 0, (WIDTH - 1) / 2], [0, FOCAL_PX, (HEIGHT - 1) / 2], [0, 0, 1]])
     homography = matrix @ rotation.T @ np.linalg.inv(matrix)
-    return np.asarray(cv2.warpPerspective(image, homography, (WIDTH, HEIGHT)), dtype=np.uint8)
+    return np.asarray(
+        cv2.warpPerspective(image, homography, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT), dtype=np.uint8
+    )
 
 
 @pytest.fixture(scope="module")
@@ -97,12 +99,24 @@ def test_nothing_moves_and_nothing_is_found(detector: AnomalyDetector) -> None:
 def test_a_turning_camera_alone_is_no_motion(detector: AnomalyDetector, rate: tuple[float, float, float]) -> None:
     source = texture(2)
     still = detector.detect(pair(source, turned(source, rate), rate=rate))
-    unaware = detector.detect(pair(source, turned(source, rate)))
+    feed_forward = detector.with_config(DetectorConfig(correction=CorrectionConfig(enabled=False)))
+    unaware = feed_forward.detect(pair(source, turned(source, rate)))
     assert still.residual is not None
     assert unaware.residual is not None
     assert still.residual.median < 3.0
     assert unaware.residual.median > 4 * still.residual.median
     assert not [roi for roi in still.rois if roi.label == "independent_motion"]
+
+
+def test_what_the_gyro_missed_is_corrected_on_the_target_image(detector: AnomalyDetector) -> None:
+    source = texture(2)
+    missed = pair(source, turned(source, (0.0, 0.3, 0.1)))
+    corrected = detector.detect(missed)
+    believed = detector.with_config(DetectorConfig(correction=CorrectionConfig(enabled=False))).detect(missed)
+    assert corrected.residual is not None
+    assert believed.residual is not None
+    assert corrected.residual.median < 0.3 * believed.residual.median
+    assert not [roi for roi in corrected.rois if roi.label == "independent_motion"]
 
 
 @pytest.mark.parametrize("rate", [(0.0, 0.0, 0.0), (0.3, 0.8, -0.5)])
@@ -214,7 +228,7 @@ def test_the_model_is_named_with_its_checksum(detector: AnomalyDetector, checkpo
 
 def test_a_device_that_is_not_there_is_refused(checkpoint: Path) -> None:
     if torch.cuda.is_available():
-        assert AnomalyDetector.from_checkpoint(checkpoint, device="cuda").device == "cuda"
+        assert AnomalyDetector.from_checkpoint(checkpoint, device="cuda").runtime == "torch"
         return
     with pytest.raises(ConfigError) as caught:
         AnomalyDetector.from_checkpoint(checkpoint, device="cuda")

@@ -27,6 +27,7 @@ from viflow_anomaly.training_data import TrainingData, load_training_data
 
 WINDOW = MotionWindowConfig(samples_before=2, samples_between=4)
 MODEL = ModelConfig(hypotheses=4, view=ViewConfig(focal_px=80.0), motion_window=WINDOW)
+MEASURES = {"epe_px", "predicted_epe_px", "identity_epe_px", "epe_ratio", "predicted_epe_ratio"}
 TRAINING = TrainingConfig(steps=6, batch_size=2, warmup_steps=2, checkpoint_every=1, validate_every=3)
 STATE = "state.safetensors"
 
@@ -92,11 +93,11 @@ def kill_at(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
 # --- resume
 
 
-@pytest.mark.parametrize("hypotheses", [1, 4])
+@pytest.mark.parametrize(("preset", "hypotheses"), [("compact", 1), ("compact", 4), ("calibrated", 4)])
 def test_a_killed_and_resumed_run_gives_the_same_bytes(
-    recordings: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hypotheses: int
+    recordings: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str, hypotheses: int
 ) -> None:
-    model = MODEL.model_copy(update={"hypotheses": hypotheses})
+    model = MODEL.model_copy(update={"preset": preset, "hypotheses": hypotheses})
     whole = fit(recordings, tmp_path / "whole", model=model)
     with monkeypatch.context() as patch:
         kill_at(patch, 3)
@@ -303,7 +304,9 @@ def test_validation_without_ground_truth_is_refused_before_anything_is_learnt(
 
 
 def test_a_loss_that_does_not_fit_the_model(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="coarser than its image") as raised:
+    with pytest.raises(
+        ConfigError, match="expected 'auto' or 'charbonnier' for the preset 'compact', found 'squared'"
+    ) as raised:
         fit([tmp_path / "never-read"], tmp_path / "out", training=changed(TRAINING, loss="squared"))
     assert (raised.value.code, raised.value.field) == ("config_invalid", "training.loss")
 
@@ -332,7 +335,7 @@ def test_what_a_run_leaves(recordings: list[Path], measured: Path, tmp_path: Pat
     assert provenance["data"] == {"recordings": 2, "names": ["euroc", "plain"], "pairs": 10, "excluded": {}}
     assert (provenance["device"], provenance["torch_version"]) == ("cpu", torch.__version__)
     metrics = provenance["metrics"]
-    assert metrics["groups"] == {"drone": {key: metrics[key] for key in ("epe_px", "identity_epe_px", "epe_ratio")}}
+    assert metrics["groups"] == {"drone": {key: metrics[key] for key in MEASURES}}
     assert metrics["identity_epe_px"] == 2.0
 
 
@@ -343,10 +346,10 @@ def test_metrics_hold_losses_wins_and_endpoint_errors(
     path = fit(recordings, tmp_path / "run", validation=[measured])
     rows = logged(tmp_path / "run")
     assert [(row["step"], set(row) - {"step"}) for row in rows] == [
-        (3, {"epe_px", "identity_epe_px", "epe_ratio"}),
+        (3, MEASURES),
         (4, {"loss", "wins"}),
         (6, {"loss", "wins"}),
-        (6, {"epe_px", "identity_epe_px", "epe_ratio"}),
+        (6, MEASURES),
     ]
     assert len(rows[1]["wins"]) == 4
     assert sum(rows[1]["wins"]) == pytest.approx(1.0, abs=1e-3)
@@ -394,7 +397,7 @@ def test_tensorboard_gets_the_same_numbers(
 
     events = EventAccumulator(str(tmp_path / "run"))
     events.Reload()
-    names = {"loss", "epe_px", "identity_epe_px", "epe_ratio", *(f"wins/{k}" for k in range(4))}
+    names = {"loss", *MEASURES, *(f"wins/{k}" for k in range(4))}
     assert set(events.Tags()["scalars"]) == names
     (loss,) = [row for row in logged(tmp_path / "run") if "loss" in row]
     (scalar,) = events.Scalars("loss")

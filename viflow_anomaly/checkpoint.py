@@ -74,7 +74,9 @@ def load_checkpoint(path: Path | None = None) -> LoadedCheckpoint:
     try:
         model.load_state_dict(load_tensors(data))
     except (SafetensorError, RuntimeError) as err:
-        raise corrupt_checkpoint(path, f"expected the tensors of the model in its .json, found: {_one_line(err)}") from err
+        raise corrupt_checkpoint(
+            path, f"expected the tensors of the model in its .json, found: {_one_line(err)}"
+        ) from err
     return LoadedCheckpoint(model.eval(), record)
 
 
@@ -104,5 +106,7 @@ def load_training_state(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str
         header_bytes = int.from_bytes(data[:8], "little")
         record: dict[str, Any] = json.loads(json.loads(data[8 : 8 + header_bytes])["__metadata__"]["record"])
     except (SafetensorError, ValueError, KeyError) as err:
-        raise corrupt_checkpoint(path, f"expected tensors and the record of a training, found: {_one_line(err)}") from err
+        raise corrupt_checkpoint(
+            path, f"expected tensors and the record of a training, found: {_one_line(err)}"
+        ) from err
     return tensors, record

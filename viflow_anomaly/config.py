@@ -62,8 +62,8 @@ class ViewConfig(FrozenConfig):
 
     mode: Literal["whole", "center_crop"] = "whole"
     focal_px: PositiveFloat = 116.0
-    max_width: PositiveInt = 208
-    max_height: PositiveInt = 208
+    max_width: PositiveInt = 192
+    max_height: PositiveInt = 128
     max_pinhole_width: PositiveInt = 320
     max_pinhole_height: PositiveInt = 256
     crop_size: PositiveInt = 224
@@ -126,7 +126,7 @@ class CorrectionConfig(FrozenConfig):
     """How the predicted motion is refined on the target image; see ``correction``."""
 
     enabled: bool = True
-    rounds: int = Field(default=6, ge=1, le=50)
+    rounds: int = Field(default=4, ge=1, le=50)
     tolerance_px: PositiveFloat = Field(default=0.7, description="view pixels at which a cell's weight is halved")
     rotation_sigma_rad: PositiveFloat = Field(default=0.004, description="how far the gyro's rotation may be off")
     translation_sigma: PositiveFloat = Field(default=1.0, description="metres; damps directions nothing speaks for")

@@ -21,8 +21,8 @@ MIN_DEPTH_RATIO = 0.1
 
 
 NOISE_RAY = 0.01
-"""Deviation of a cell's measurement as the prior sees it, in focal lengths. Neighbouring cells err alike, so each counts
-as less than its own precision of a few thousandths."""
+"""Deviation of a cell's measurement as the prior sees it, in focal lengths. Neighbours err alike, so each counts as less
+than its own precision of a few thousandths."""
 BLEND_SIGMA = 0.5
 """How far the weights of the other hypotheses go from the winner's 1 and their 0."""
 
@@ -41,7 +41,7 @@ class Correction(NamedTuple):
         flow_px: [h, w, 2] float32.
         motion: the corrected camera motion, None where the network gives flow only.
         inlier_share: confident cells that agree with the corrected flow, 0..1; 0 where nothing was confident.
-        shift_px: how far the correction moved the prediction, mean over cells.
+        shift_px: how far the correction moved the prediction, |du| + |dv|, mean over cells.
         converged: False: the prediction stands as it was.
     """
 
@@ -55,22 +55,26 @@ class Correction(NamedTuple):
 def rigid_flow_px(
     rays: Float32Array, inverse_depth: Float32Array, motion: RigidMotion, focal_px: float
 ) -> Float32Array:
-    """Flow [h, w, 2] of a static world; rays [h, w, 2] in focal lengths, inverse_depth [h, w]."""
-    moved_x, moved_y, _ = _moved(rays, inverse_depth, motion)
-    return np.stack([moved_x - rays[..., 0], moved_y - rays[..., 1]], axis=-1) * np.float32(focal_px)
+    """Flow [..., 2] of a static world; rays [..., 2] in focal lengths, inverse_depth [...]."""
+    x, y = rays[..., 0], rays[..., 1]
+    moved_x, moved_y, _ = _moved(x, y, inverse_depth, motion)
+    flow = np.empty_like(rays)
+    np.subtract(moved_x, x, out=flow[..., 0])
+    np.subtract(moved_y, y, out=flow[..., 1])
+    flow *= np.float32(focal_px)
+    return flow
 
 
 def _moved(
-    rays: Float32Array, inverse_depth: Float32Array, motion: RigidMotion
+    x: Float32Array, y: Float32Array, inverse_depth: Float32Array, motion: RigidMotion
 ) -> tuple[Float32Array, Float32Array, Float32Array]:
     """(x, y) of every ray after the motion, and its inverse depth there."""
-    x, y = rays[..., 0], rays[..., 1]
     rotation, translation = motion.rotation.astype(np.float32), motion.translation_m.astype(np.float32)
     px, py, pz = (
-        row[0] * x + row[1] * y + (row[2] + inverse_depth * t) for row, t in zip(rotation, translation, strict=True)
+        row[0] * x + row[1] * y + row[2] + inverse_depth * t for row, t in zip(rotation, translation, strict=True)
     )
-    pz = np.maximum(pz, np.float32(MIN_DEPTH_RATIO))
-    return px / pz, py / pz, inverse_depth / pz
+    nearness = 1 / np.maximum(pz, np.float32(MIN_DEPTH_RATIO))
+    return px * nearness, py * nearness, inverse_depth * nearness
 
 
 def correct_motion(
@@ -86,35 +90,55 @@ def correct_motion(
     Args:
         rays: [h, w, 2] of each cell, in focal lengths.
         inverse_depth: [h, w].
-        start: the IMU's rotation and the winning hypothesis' translation.
+        start: the IMU's rotation and the translation of the nearest hypothesis.
         measured: on the same cells.
         focal_px: of the view.
         config: how far and how hard.
     """
     thin = _lattice(measured, config)
-    rays_thin, depth_thin = rays[thin], inverse_depth[thin]
-    measured_thin, confidence = measured.flow_px[thin].reshape(-1, 2), measured.confidence[thin].reshape(-1)
-    rotation, translation = start
-    turned = np.zeros(3)
-    prior = np.zeros(6)
-    prior[:3] = 1 / config.rotation_sigma_rad**2
-    prior[3:] = 1 / max(config.translation_sigma, 1e-9) ** 2
+    x, y = (np.ascontiguousarray(rays[thin][..., axis]).reshape(-1) for axis in (0, 1))
+    depth = np.ascontiguousarray(inverse_depth[thin]).reshape(-1)
+    goal = measured.flow_px[thin].reshape(-1, 2).T / np.float32(focal_px) + (x, y)  # 2, N
+    confidence = measured.confidence[thin].reshape(-1)
+    prior = _prior(config)
+    motion, turned = start, np.zeros(3)
+    jacobian = np.zeros((2, 6, x.size), dtype=np.float32)
     for round_ in range(config.rounds):
-        motion = RigidMotion(rotation, translation)
-        x, y, q = (part.reshape(-1) for part in _moved(rays_thin, depth_thin, motion))
-        flow = np.stack([x, y], axis=-1) - rays_thin.reshape(-1, 2)
-        error_px = measured_thin - flow * np.float32(focal_px)
-        weights = robust_weights(error_px, confidence, config.tolerance_px * max(1.0, 3.0 - round_))
-        zero = np.zeros_like(x)
-        du = np.stack([-x * y, 1 + x * x, -y, q, zero, -q * x], axis=-1)
-        dv = np.stack([-1 - y * y, x * y, x, zero, q, -q * y], axis=-1)
-        step = _weighted_step(du, dv, error_px / np.float32(focal_px), weights, prior, _pull(prior, turned))
+        moved_x, moved_y, nearness = _moved(x, y, depth, motion)
+        error = goal - (moved_x, moved_y)
+        weights = robust_weights(error, confidence, _tolerance(config, round_) / focal_px)
+        _fill_jacobian(jacobian, moved_x, moved_y, nearness)
+        step = _weighted_step(jacobian, error, weights, prior, _pull(prior, turned))
         turned = turned + step[:3]
-        rotation, translation = so3_exp(step[:3]) @ rotation, translation + step[3:]
+        motion = RigidMotion(so3_exp(step[:3]) @ motion.rotation, motion.translation_m + step[3:])
     before = rigid_flow_px(rays, inverse_depth, start, focal_px)
-    motion = RigidMotion(rotation, translation)
     after = rigid_flow_px(rays, inverse_depth, motion, focal_px)
     return _accepted(before, after, measured, config, start, motion)
+
+
+def _fill_jacobian(jacobian: Float32Array, x: Float32Array, y: Float32Array, nearness: Float32Array) -> None:
+    """[2, 6, N]: how (x, y) after the motion follow a further rotation and translation of the camera."""
+    xy = x * y
+    np.negative(xy, out=jacobian[0, 0])
+    np.add(x * x, 1, out=jacobian[0, 1])
+    np.negative(y, out=jacobian[0, 2])
+    jacobian[0, 3] = nearness
+    np.multiply(nearness, -x, out=jacobian[0, 5])
+    np.subtract(-1, y * y, out=jacobian[1, 0])
+    jacobian[1, 1] = xy
+    jacobian[1, 2] = x
+    jacobian[1, 4] = nearness
+    np.multiply(nearness, -y, out=jacobian[1, 5])
+
+
+def _prior(config: CorrectionConfig) -> Float64Array:
+    """[6] inverse variances of rotation and translation."""
+    return np.repeat([1 / config.rotation_sigma_rad**2, 1 / config.translation_sigma**2], 3)
+
+
+def _tolerance(config: CorrectionConfig, round_: int) -> float:
+    """Wide in the first rounds: the start may be far off."""
+    return config.tolerance_px * max(1.0, 3.0 - round_)
 
 
 def correct_flow(
@@ -137,23 +161,34 @@ def correct_flow(
     """
     start = hypotheses_px[winner]
     x, y = rays[..., 0], rays[..., 1]
-    turns = [np.stack(one, axis=-1) for one in ((-x * y, -1 - y * y), (1 + x * x, x * y), (-y, x))]
-    others = [(one - start) / np.float32(focal_px) for k, one in enumerate(hypotheses_px) if k != winner]
-    basis = np.stack([*turns, *others], axis=-1)  # h, w, 2, 3 + K - 1
-    prior = np.full(basis.shape[-1], 1 / BLEND_SIGMA**2)
+    turns = [np.stack(one) for one in ((-x * y, -1 - y * y), (1 + x * x, x * y), (-y, x))]
+    others = [(one - start).transpose(2, 0, 1) / focal_px for k, one in enumerate(hypotheses_px) if k != winner]
+    basis = np.stack([*turns, *others], axis=1).astype(np.float32)  # 2, 3 + K - 1, h, w
+    prior = np.full(basis.shape[1], 1 / BLEND_SIGMA**2)
     prior[:3] = 1 / config.rotation_sigma_rad**2
     thin = _lattice(measured, config)
-    basis_thin = basis[thin].reshape(-1, 2, basis.shape[-1])
-    error_px = (measured.flow_px - start)[thin].reshape(-1, 2)
+    jacobian = basis[:, :, *thin].reshape(2, len(prior), -1)
+    goal = ((measured.flow_px - start)[thin] / np.float32(focal_px)).reshape(-1, 2).T
     confidence = measured.confidence[thin].reshape(-1)
-    solution = np.zeros(basis.shape[-1])
+    solution = np.zeros(len(prior))
     for round_ in range(config.rounds):
-        left_px = error_px - (basis_thin @ solution.astype(np.float32)) * np.float32(focal_px)
-        weights = robust_weights(left_px, confidence, config.tolerance_px * max(1.0, 3.0 - round_))
-        du, dv = basis_thin[:, 0], basis_thin[:, 1]
-        solution = _weighted_step(du, dv, error_px / np.float32(focal_px), weights, prior, 0 * prior)
-    after = start + (basis @ solution.astype(np.float32)) * np.float32(focal_px)
-    return _accepted(start, after, measured, config, None, None)
+        error = goal - np.tensordot(solution.astype(np.float32), jacobian, (0, 1))
+        weights = robust_weights(error, confidence, _tolerance(config, round_) / focal_px)
+        solution = _weighted_step(jacobian, goal, weights, prior, np.zeros(len(prior)))
+    shift = np.tensordot(solution.astype(np.float32), basis, (0, 1)).transpose(1, 2, 0)
+    return _accepted(start, start + shift * np.float32(focal_px), measured, config, None, None)
+
+
+def nearest_hypothesis(hypotheses_px: Float32Array, measured: MeasuredFlow, config: CorrectionConfig) -> int:
+    """The hypothesis [K, h, w, 2] that most of the measured flow agrees with: where a correction starts."""
+    if len(hypotheses_px) == 1:
+        return 0
+    thin = _lattice(measured, config)
+    error = (hypotheses_px[:, *thin] - measured.flow_px[thin]).reshape(len(hypotheses_px), -1, 2)
+    confidence = measured.confidence[thin].reshape(-1)
+    squared = np.square(error).sum(axis=-1)
+    cost = np.log1p(squared / np.float32((3 * config.tolerance_px) ** 2)) @ confidence
+    return int(np.argmin(cost))
 
 
 def _lattice(measured: MeasuredFlow, config: CorrectionConfig) -> tuple[slice, slice]:
@@ -170,26 +205,21 @@ def _pull(prior: Float64Array, turned: Float64Array) -> Float64Array:
     return pull
 
 
-def robust_weights(error_px: Float32Array, confidence: Float32Array, tolerance_px: float) -> Float32Array:
-    """Cauchy weights [N] of errors [N, 2]: half at ``tolerance_px``."""
-    squared = np.square(error_px).sum(axis=-1)
-    return np.asarray(confidence / (1 + squared / np.float32(tolerance_px**2)), dtype=np.float32)
+def robust_weights(error: Float32Array, confidence: Float32Array, tolerance: float) -> Float32Array:
+    """Cauchy weights [N] of errors [2, N]: half at ``tolerance``, in the errors' unit."""
+    scaled = error * np.float32(1 / tolerance)
+    return np.asarray(confidence / (1 + scaled[0] * scaled[0] + scaled[1] * scaled[1]), dtype=np.float32)
 
 
 def _weighted_step(
-    du: Float32Array,
-    dv: Float32Array,
-    error: Float32Array,
-    weights: Float32Array,
-    prior: Float64Array,
-    pull: Float64Array,
+    jacobian: Float32Array, error: Float32Array, weights: Float32Array, prior: Float64Array, pull: Float64Array
 ) -> Float64Array:
-    """Solve the normal equations; errors in focal lengths, information of one cell about (focal length)^2 / px^2."""
-    information = 1.0 / NOISE_RAY**2
-    weighted_u, weighted_v = du * weights[:, None], dv * weights[:, None]
-    normal = (weighted_u.T @ du + weighted_v.T @ dv).astype(np.float64) * information
-    gradient = (weighted_u.T @ error[:, 0] + weighted_v.T @ error[:, 1]).astype(np.float64) * information
-    return np.asarray(np.linalg.solve(normal + np.diag(prior), gradient + pull))
+    """Solve the normal equations of jacobian [2, P, N] and error [2, N], both in focal lengths."""
+    weighted = jacobian * (weights * np.float32(1 / NOISE_RAY**2))
+    normal = (weighted[0] @ jacobian[0].T + weighted[1] @ jacobian[1].T).astype(np.float64)
+    gradient = (weighted[0] @ error[0] + weighted[1] @ error[1]).astype(np.float64)
+    normal[np.diag_indices_from(normal)] += prior
+    return np.asarray(np.linalg.solve(normal, gradient + pull))
 
 
 def _accepted(
@@ -201,16 +231,19 @@ def _accepted(
     motion: RigidMotion | None,
 ) -> Correction:
     """Take the correction where it explains the measurement better than the prediction did."""
-    total = float(measured.confidence.sum())
-    enough = config.min_confidence * measured.confidence.size
+    thin = _lattice(measured, config)
+    confidence = measured.confidence[thin]
+    total = float(confidence.sum())
+    enough = config.min_confidence * confidence.size
 
     def inliers(flow: Float32Array) -> float:
-        weights = robust_weights(measured.flow_px - flow, measured.confidence, config.tolerance_px)
+        error = (measured.flow_px[thin] - flow[thin]).reshape(-1, 2).T
+        weights = robust_weights(error, confidence.reshape(-1), config.tolerance_px)
         return float(weights.sum()) / total if total > 0 else 0.0
 
     share, share_before = inliers(after), inliers(before)
-    converged = bool(np.isfinite(after).all()) and share >= share_before and total > enough
+    converged = total > enough and share >= share_before and bool(np.isfinite(after[thin]).all())
     if not converged:
         return Correction(before, start, share_before, 0.0, converged=False)
-    shift = float(np.linalg.norm(after - before, axis=-1).mean())
+    shift = float(np.abs(after[thin] - before[thin]).sum(axis=-1).mean())
     return Correction(after, motion, share, shift, converged=True)

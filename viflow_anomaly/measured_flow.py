@@ -6,6 +6,7 @@ The measurement corrects the network's prediction (``correction``); it never rep
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -15,13 +16,13 @@ from viflow_anomaly.geometry import Float32Array, pixel_grid
 from viflow_anomaly.sensor_data import Uint8Array
 
 TEXTURE_GRAY2 = 2.0
-"""Smaller eigenvalue of the structure tensor (gray levels^2 a pixel^2) at which a cell is half trusted."""
+"""Smaller eigenvalue of the structure tensor of the halved view (gray levels^2 a pixel^2) that is half trusted."""
 MISMATCH_GRAY = 8.0
-"""Photometric difference after the measured flow at which a cell is half trusted."""
+"""Photometric difference after the measured flow that is half trusted."""
 WINDOW_PX = 5
-"""On the halved picture: 10 px of the view."""
+"""Of the structure tensor, on the halved view."""
 FINEST_SCALE = 1
-"""Inverse search stops at half the view's resolution."""
+"""Inverse search stops at half the view's resolution, and so does the judgement of its flow."""
 MIN_SIDE_PX = 32
 """Inverse search needs a few patches of 8 pixels along each side of its finest level."""
 
@@ -41,7 +42,7 @@ class MeasuredFlow(NamedTuple):
 
 
 def measure_flow(source: Uint8Array, target: Uint8Array, *, stride: int) -> MeasuredFlow:
-    """Measure the flow between two views [H, W]; sides are multiples of ``stride``.
+    """Measure the flow between two views [H, W]; sides are multiples of ``stride``, and even.
 
     Source: Kroeger et al., Fast Optical Flow using Dense Inverse Search (ECCV 2016); OpenCV's preset "ultrafast", one
     level finer, because views are small.
@@ -53,23 +54,32 @@ def measure_flow(source: Uint8Array, target: Uint8Array, *, stride: int) -> Meas
     search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)  # type: ignore[attr-defined]
     search.setFinestScale(FINEST_SCALE)
     flow = search.calc(source, target, None)
-    matched = cv2.remap(  # type: ignore[call-overload]  # the stubs lack the two-channel map
-        target, pixel_grid(height, width) + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+    flow_px = np.asarray(cv2.resize(flow, cells, interpolation=cv2.INTER_AREA), dtype=np.float32)
+    half = (width // 2, height // 2)
+    small_source, small_target = (
+        np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), dtype=np.uint8) for image in (source, target)
     )
-    mismatch = cv2.resize(cv2.absdiff(matched, source), cells, interpolation=cv2.INTER_AREA).astype(np.float32)
-    texture = _texture(source, cells)
-    confidence = texture / (texture + TEXTURE_GRAY2) / (1 + (mismatch / MISMATCH_GRAY) ** 2)
-    flow_px = cv2.resize(flow, cells, interpolation=cv2.INTER_AREA)
-    return MeasuredFlow(np.asarray(flow_px, dtype=np.float32), confidence.astype(np.float32), stride)
+    at = cv2.resize(flow, half, interpolation=cv2.INTER_NEAREST) * np.float32(0.5) + _grid(half[1], half[0])
+    matched = cv2.remap(  # type: ignore[call-overload]  # the stubs lack the two-channel map
+        small_target, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+    )
+    mismatch = cv2.resize(cv2.absdiff(matched, small_source), cells, interpolation=cv2.INTER_AREA)
+    mismatch = mismatch * np.float32(1 / MISMATCH_GRAY)
+    texture = _texture(small_source, cells)
+    confidence = texture / ((texture + np.float32(TEXTURE_GRAY2)) * (1 + mismatch * mismatch))
+    return MeasuredFlow(flow_px, np.asarray(confidence, dtype=np.float32), stride)
+
+
+@lru_cache(maxsize=8)
+def _grid(height: int, width: int) -> Float32Array:
+    grid = pixel_grid(height, width)
+    grid.setflags(write=False)
+    return grid
 
 
 def _texture(image: Uint8Array, cells: tuple[int, int]) -> Float32Array:
     """Smaller eigenvalue of the structure tensor [h, w]: near zero on plain surfaces and along straight edges."""
-    half = cv2.pyrDown(image)
-    dx = cv2.Sobel(half, cv2.CV_32F, 1, 0, scale=1 / 16)
-    dy = cv2.Sobel(half, cv2.CV_32F, 0, 1, scale=1 / 16)
-    blurred = [cv2.blur(product, (WINDOW_PX, WINDOW_PX)) for product in (dx * dx, dy * dy, dx * dy)]
-    xx, yy, xy = (cv2.resize(product, cells, interpolation=cv2.INTER_AREA) for product in blurred)
-    half_trace, half_difference = (xx + yy) / 2, (xx - yy) / 2
-    smaller = half_trace - np.sqrt(half_difference * half_difference + xy * xy)
-    return np.asarray(np.maximum(smaller, 0.0), dtype=np.float32)
+    smaller = cv2.cornerMinEigenVal(image, WINDOW_PX, ksize=3)
+    # OpenCV scales gradients by 1 / (2^(ksize - 1) * block * 255) before it sums their products over the block.
+    gray2 = (4 * WINDOW_PX * 255) ** 2 / (WINDOW_PX * WINDOW_PX) / 64
+    return np.asarray(cv2.resize(smaller, cells, interpolation=cv2.INTER_AREA), dtype=np.float32) * np.float32(gray2)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from viflow_anomaly.config import CorrectionConfig
-from viflow_anomaly.correction import Correction, correct_flow, correct_motion
+from viflow_anomaly.correction import Correction, correct_flow, correct_motion, nearest_hypothesis
 from viflow_anomaly.geometry import Float32Array, pixel_grid
 from viflow_anomaly.measured_flow import MeasuredFlow, measure_flow
 from viflow_anomaly.model_input import ModelInput
@@ -49,7 +49,8 @@ def predict_flow(
     Args:
         runtime: of the network.
         model_input: the pair.
-        config: of the correction; off, the winner stands as the network predicted it (the paper's method).
+        config: of the correction, which starts at the hypothesis nearest to the measured flow. Off: the hypothesis that
+            reconstructs the source best stands as the network predicted it (the paper's method).
         focal_px: of the view.
     """
     return correct(runtime.predict(model_input), model_input, config, focal_px=focal_px)
@@ -59,11 +60,13 @@ def correct(
     hypotheses: Hypotheses, model_input: ModelInput, config: CorrectionConfig, *, focal_px: float
 ) -> PredictedFlow:
     """Choose a hypothesis and correct it; arguments as in ``predict_flow``."""
-    winner = choose_hypothesis(hypotheses, model_input.source, model_input.target)
-    predicted, stride = hypotheses.flow_px[winner], hypotheses.stride
+    stride = hypotheses.stride
     if not config.enabled:
-        return PredictedFlow(predicted, stride, winner, predicted, None, None)
+        winner = choose_hypothesis(hypotheses, model_input.source, model_input.target)
+        return PredictedFlow(hypotheses.flow_px[winner], stride, winner, hypotheses.flow_px[winner], None, None)
     measured = measure_flow(model_input.source, model_input.target, stride=stride)
+    winner = nearest_hypothesis(hypotheses.flow_px, measured, config)
+    predicted = hypotheses.flow_px[winner]
     rays = view_rays(*predicted.shape[:2], stride, *model_input.source.shape, focal_px)
     if hypotheses.scene is None:
         correction = correct_flow(rays, hypotheses.flow_px, winner, measured, focal_px, config)
@@ -117,7 +120,7 @@ def _shrunk(flow_px: Float32Array, size: tuple[int, int], factor: int) -> Float3
 
 
 def _charbonnier(first: Float32Array, second: Float32Array) -> Float32Array:
-    return np.sqrt(np.square(first - second) + np.float32(CHARBONNIER_EPSILON**2))
+    return np.asarray(np.sqrt(np.square(first - second) + np.float32(CHARBONNIER_EPSILON**2)), dtype=np.float32)
 
 
 def _reconstruction_error(

@@ -1,4 +1,4 @@
-"""The unsupervised loss of the preset ``calibrated``: hypotheses compete, and depth is judged under the corrected motion.
+"""The unsupervised loss of the preset ``calibrated``: hypotheses compete, depth is judged under the corrected motion.
 
 The IMU cannot see speed, so no hypothesis fits a pair exactly, and depth judged by the winner alone would learn to make
 up for a wrong translation. So the winner's motion is first corrected on the target image, with the same function that

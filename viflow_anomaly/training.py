@@ -67,7 +67,7 @@ class TrainingRun:
         return float(loss.detach()), torch.bincount(winners, minlength=self.model_config.hypotheses)
 
     def _relit(self, source: torch.Tensor) -> torch.Tensor:
-        """What the network is shown: another exposure, contrast and noise than the loss sees, a function of the step."""
+        """What the network is shown: another exposure, contrast and noise than the loss sees, by the step's number."""
         strength = self.config.relighting
         if not strength:
             return source
@@ -195,7 +195,9 @@ def train(
             field="out",
         )
     with TrainingProgress(out_dir, steps=training.steps, first_step=run.step, visible=progress) as reporter:
-        training_data = load_training_data(data, model, training.look_aheads, measure=loss == "corrected", on_progress=reporter.loading)
+        training_data = load_training_data(
+            data, model, training.look_aheads, measure=loss == "corrected", on_progress=reporter.loading
+        )
         errors = _run_steps(run, training_data, validation, out_dir, fingerprint, reporter)
     provenance = {
         "package_version": __version__,

@@ -54,7 +54,7 @@ class PairBucket:
         flow = self.measured_px[index].astype(np.float32)
         confidence = self.confidence[index].astype(np.float32) / 255
         if mirrored:
-            flow, confidence = flow[:, ::-1] * np.float32((-1, 1)), confidence[:, ::-1]
+            flow, confidence = flow[:, ::-1] * np.array((-1, 1), np.float32), confidence[:, ::-1]
         return MeasuredFlow(flow, confidence, FLOW_STRIDE)
 
 

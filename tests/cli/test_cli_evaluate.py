@@ -56,7 +56,14 @@ def test_json(ask: Ask, recordings: list[Path], checkpoint: Path) -> None:
         "drone_000001": 2,
         "drone_000002": 1,
     }
-    assert set(report["all"]) == {"epe_px", "identity_epe_px", "epe_ratio", "pairs"}
+    assert set(report["all"]) == {
+        "epe_px",
+        "predicted_epe_px",
+        "identity_epe_px",
+        "epe_ratio",
+        "predicted_epe_ratio",
+        "pairs",
+    }
     assert report["all"]["pairs"] == 4
     assert report["all"]["identity_epe_px"] == 2.0
     assert report["all"]["epe_ratio"] == pytest.approx(report["all"]["epe_px"] / 2.0, abs=1e-3)
@@ -75,7 +82,7 @@ def test_table(ask: Ask, recordings: list[Path], checkpoint: Path) -> None:
         "drone": "3",
         "all": "4",
     }
-    assert rows["all"][2] == "2.000"
+    assert rows["all"][3] == "2.000"
 
 
 def test_out_holds_the_same_json(ask: Ask, recordings: list[Path], checkpoint: Path, tmp_path: Path) -> None:
@@ -84,7 +91,7 @@ def test_out_holds_the_same_json(ask: Ask, recordings: list[Path], checkpoint: P
     assert out.read_text() == answer.out
     assert list(out.parent.iterdir()) == [out]
     table = ask(flow(recordings, checkpoint, "--out", str(out)))
-    assert "identity EPE px" in table.out
+    assert "predicted" in table.out
     assert json.loads(out.read_text())["groups"] == json.loads(answer.out)["groups"]
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,18 +10,17 @@ from simulated_truth import add_ground_truth
 from torch import nn
 from worlds import make_world, write_euroc
 
-from viflow_anomaly.config import ModelConfig, MotionWindowConfig, ViewConfig
-from viflow_anomaly.datasets.pairing import RecordingPairs
+from viflow_anomaly.config import CorrectionConfig, ModelConfig, MotionWindowConfig, ViewConfig
 from viflow_anomaly.datasets.registry import open_recording
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.evaluation.endpoint_error import (
     EndpointErrors,
     PairError,
     measure_endpoint_errors,
-    predict_flow,
     require_ground_truth,
 )
 from viflow_anomaly.model.outputs import ViflowOutput
+from viflow_anomaly.runtime.torch_runtime import TorchRuntime
 
 CONFIG = ModelConfig(hypotheses=4, motion_window=MotionWindowConfig(samples_before=2, samples_between=4))
 FOCAL_PX = 80.0  # of the world's camera
@@ -41,8 +41,26 @@ class ConstantFlow(nn.Module):
         return ViflowOutput(flow.clone(), self.stride)
 
 
+def measured(
+    network: nn.Module, config: ModelConfig, recordings: list[Path], *, corrected: bool = False, **more: Any
+) -> EndpointErrors:
+    correction = CorrectionConfig(enabled=corrected)
+    return measure_endpoint_errors(TorchRuntime(network), config, recordings, correction=correction, **more)
+
+
 def config_of(focal_px: float) -> ModelConfig:
     return CONFIG.model_copy(update={"view": ViewConfig(focal_px=focal_px)})
+
+
+def summary(epe_px: Any, identity_px: float, ratio: float) -> dict[str, Any]:
+    """Without correction what is used is what was predicted."""
+    return {
+        "epe_px": epe_px,
+        "predicted_epe_px": epe_px,
+        "identity_epe_px": identity_px,
+        "epe_ratio": ratio,
+        "predicted_epe_ratio": ratio,
+    }
 
 
 @pytest.fixture
@@ -55,47 +73,48 @@ def drone(tmp_path: Path) -> Path:
 def test_the_true_flow_has_no_error_at_any_scale_of_the_view(drone: Path, focal_px: float, stride: int) -> None:
     true_px = -2.0 * focal_px / FOCAL_PX
     network = ConstantFlow((true_px, 0.0), (5.0, 5.0), (0.0, 0.0), (-true_px, 0.0), stride=stride)
-    errors = measure_endpoint_errors(network, config_of(focal_px), [drone])
+    errors = measured(network, config_of(focal_px), [drone])
     assert len(errors.pairs) == 3
     for pair in errors.pairs:
         assert pair.epe_px == pytest.approx(0.0, abs=1e-4)
         assert pair.identity_epe_px == 2.0
         assert pair.hypothesis == 0
-    assert errors.summary() == {"epe_px": pytest.approx(0.0, abs=1e-4), "identity_epe_px": 2.0, "epe_ratio": 0.0}
+    assert errors.summary() == summary(pytest.approx(0.0, abs=1e-4), 2.0, 0.0)
 
 
 def test_no_motion_has_the_identity_error(drone: Path) -> None:
-    errors = measure_endpoint_errors(ConstantFlow((0.0, 0.0)), config_of(FOCAL_PX), [drone])
-    assert errors.summary() == {"epe_px": 2.0, "identity_epe_px": 2.0, "epe_ratio": 1.0}
+    errors = measured(ConstantFlow((0.0, 0.0)), config_of(FOCAL_PX), [drone])
+    assert errors.summary() == summary(2.0, 2.0, 1.0)
 
 
 def test_the_error_is_a_distance(drone: Path) -> None:
-    errors = measure_endpoint_errors(ConstantFlow((1.0, 4.0)), config_of(FOCAL_PX), [drone])
-    assert errors.summary() == {"epe_px": 5.0, "identity_epe_px": 2.0, "epe_ratio": 2.5}
+    errors = measured(ConstantFlow((1.0, 4.0)), config_of(FOCAL_PX), [drone])
+    assert errors.summary() == summary(5.0, 2.0, 2.5)
 
 
 def test_the_hypothesis_is_chosen_without_ground_truth(tmp_path: Path) -> None:
     """The picture moves 2 px; a ground truth that says otherwise does not change the choice."""
     folder = add_ground_truth(tmp_path / "drone_1", shift_px=6.0)
     network = ConstantFlow((-6.0, 0.0), (-2.0, 0.0))
-    errors = measure_endpoint_errors(network, config_of(FOCAL_PX), [folder])
+    errors = measured(network, config_of(FOCAL_PX), [folder])
     assert [pair.hypothesis for pair in errors.pairs] == [1, 1]
     assert errors.summary()["epe_px"] == 4.0
+
+
+def test_the_correction_finds_a_flow_between_the_hypotheses(drone: Path) -> None:
+    """The picture moves by -2 px; the hypotheses say -3 and +1."""
+    errors = measured(ConstantFlow((-3.0, 0.0), (1.0, 0.0)), config_of(FOCAL_PX), [drone], corrected=True)
+    for pair in errors.pairs:
+        assert pair.predicted_epe_px == pytest.approx(1.0, abs=1e-3)
+        assert pair.epe_px < 0.3
 
 
 def test_only_pixels_with_ground_truth_count(tmp_path: Path) -> None:
     valid = np.zeros((64, 96), np.bool_)
     valid[:, :10] = True
     folder = add_ground_truth(tmp_path / "drone_1", valid=valid)
-    errors = measure_endpoint_errors(ConstantFlow((-2.0, 1.0)), config_of(FOCAL_PX), [folder])
-    assert errors.summary() == {"epe_px": 1.0, "identity_epe_px": 2.0, "epe_ratio": 0.5}
-
-
-def test_predicted_flow_is_in_source_pixels(drone: Path) -> None:
-    pair = RecordingPairs(open_recording(drone))[0]
-    flow, winner = predict_flow(ConstantFlow((-1.0, 0.5)), config_of(40.0), pair, device="cpu")
-    assert (flow.shape, winner) == ((64, 96, 2), 0)
-    np.testing.assert_allclose(flow, np.broadcast_to([-2.0, 1.0], flow.shape), atol=1e-4)
+    errors = measured(ConstantFlow((-2.0, 1.0)), config_of(FOCAL_PX), [folder])
+    assert errors.summary() == summary(1.0, 2.0, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -103,7 +122,7 @@ def test_predicted_flow_is_in_source_pixels(drone: Path) -> None:
 )
 def test_pairs_are_spread_evenly(drone: Path, wanted: int | None, found: list[int]) -> None:
     steps: list[tuple[int, int]] = []
-    errors = measure_endpoint_errors(
+    errors = measured(
         ConstantFlow((0.0, 0.0)),
         config_of(FOCAL_PX),
         [drone],
@@ -117,7 +136,7 @@ def test_pairs_are_spread_evenly(drone: Path, wanted: int | None, found: list[in
 
 def test_errors_by_sequence_and_group() -> None:
     def pair(sequence: str, epe_px: float) -> PairError:
-        return PairError(sequence, 0, epe_px, 4.0, 0)
+        return PairError(sequence, 0, epe_px, 2 * epe_px, 4.0, 0)
 
     errors = EndpointErrors((pair("drone_2", 1), pair("car_1", 2), pair("drone_1", 3), pair("plain", 4)))
     assert {name: some.summary()["epe_px"] for name, some in errors.per_sequence().items()} == {
@@ -135,7 +154,7 @@ def test_errors_by_sequence_and_group() -> None:
 
 
 def test_a_world_that_stands_still_has_no_ratio() -> None:
-    summary = EndpointErrors((PairError("a", 0, 1.0, 0.0, 0),)).summary()
+    summary = EndpointErrors((PairError("a", 0, 1.0, 1.0, 0.0, 0),)).summary()
     assert np.isnan(summary["epe_ratio"])
 
 
@@ -144,7 +163,7 @@ def test_a_world_that_stands_still_has_no_ratio() -> None:
 
 def refusal(folder: Path, *, at_once: bool) -> DatasetError:
     def measure(folders: list[Path]) -> None:
-        measure_endpoint_errors(ConstantFlow((0.0, 0.0)), config_of(FOCAL_PX), folders)
+        measured(ConstantFlow((0.0, 0.0)), config_of(FOCAL_PX), folders)
 
     with pytest.raises(DatasetError, match=str(folder)) as raised:
         (require_ground_truth if at_once else measure)([folder])

@@ -61,7 +61,6 @@ def flow(
 
     from viflow_anomaly.checkpoint_record import write_atomically
     from viflow_anomaly.evaluation.endpoint_error import measure_endpoint_errors, require_ground_truth
-
     from viflow_anomaly.runtime.loading import load_runtime
 
     cv2.setNumThreads(settings.threads)
@@ -123,7 +122,9 @@ def _print_table(errors: EndpointErrors, record: CheckpointRecord) -> None:
     from rich.markup import escape
     from rich.table import Column, Table
 
-    columns = [Column(name, justify="right") for name in ("pairs", "EPE px", "predicted", "identity", "ratio", "predicted")]
+    columns = [
+        Column(name, justify="right") for name in ("pairs", "EPE px", "predicted", "identity", "ratio", "predicted")
+    ]
     table = Table(Column("sequence", no_wrap=True), *columns, box=SIMPLE)
     parts = [errors.per_sequence(), errors.per_group(), {"all": errors}]
     for part in parts:

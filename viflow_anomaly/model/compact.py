@@ -59,4 +59,4 @@ class CompactViflow(ConvolutionalViflow):
     def _local_flow(self, source: torch.Tensor, code: torch.Tensor, rays: torch.Tensor) -> torch.Tensor:
         """Shifts [B, K, 2, h, w] in focal lengths, from the source image and the motion code."""
         shifts: torch.Tensor = self.local_head(self.features(source, code, rays))
-        return shifts.unflatten(1, (self.hypotheses, 2))
+        return shifts.reshape(len(shifts), self.hypotheses, 2, *shifts.shape[-2:])

@@ -29,9 +29,7 @@ class _Tensors(nn.Module):
         super().__init__()
         self.network = network
 
-    def forward(
-        self, source: torch.Tensor, motion: torch.Tensor, interval_s: torch.Tensor
-    ) -> tuple[torch.Tensor, ...]:
+    def forward(self, source: torch.Tensor, motion: torch.Tensor, interval_s: torch.Tensor) -> tuple[torch.Tensor, ...]:
         output: ViflowOutput = self.network(source, motion, interval_s)
         return (output.flow_px,) if output.scene is None else (output.flow_px, *output.scene)
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple, Protocol
 
 from viflow_anomaly.correction import RigidMotion
-from viflow_anomaly.geometry import Float32Array, Float64Array
+from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.model_input import ModelInput
+from viflow_anomaly.sensor_data import Float64Array
 
 
 class Scene(NamedTuple):

@@ -11,6 +11,7 @@ from viflow_anomaly.config import RuntimeName
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.runtime.interface import Runtime
 
+
 class LoadedRuntime(NamedTuple):
     """A network ready to run, and where it came from."""
 
