@@ -21,7 +21,7 @@ MIN_DEPTH_RATIO = 0.1
 
 
 NOISE_RAY = 0.01
-"""Deviation of a cell's measurement as the prior sees it, in focal lengths. Neighbours err alike, so each counts as less
+"""Deviation of a cell's measurement as the prior sees it, in focal lengths. Neighbours err alike: each counts as less
 than its own precision of a few thousandths."""
 BLEND_SIGMA = 0.5
 """How far the weights of the other hypotheses go from the winner's 1 and their 0."""
