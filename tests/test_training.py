@@ -195,6 +195,54 @@ def test_resume_with_another_configuration_is_refused(recordings: list[Path], tm
     assert str(tmp_path) in raised.value.message
 
 
+def test_resume_with_other_recordings_is_refused(recordings: list[Path], tmp_path: Path) -> None:
+    short = changed(TRAINING, steps=1)
+    fit(recordings, tmp_path, training=short)
+    for data in (recordings[:1], [*recordings, recordings[0]], [recordings[0], tmp_path / "monday"]):
+        with pytest.raises(ConfigError, match="--resume expects the recordings") as raised:
+            fit(data, tmp_path, training=short, resume=True)
+        assert (raised.value.code, raised.value.field) == ("resume_config_differs", "recordings")
+    assert "2, found 2: without ['euroc'], with ['monday']" in raised.value.message
+
+
+def test_resume_with_other_validation_recordings_is_refused(
+    recordings: list[Path], measured: Path, tmp_path: Path
+) -> None:
+    short = changed(TRAINING, steps=1)
+    fit(recordings, tmp_path, training=short)
+    with pytest.raises(ConfigError, match=r"0, found 1: without \[\], with \['drone_000001'\]") as raised:
+        fit(recordings, tmp_path, training=short, validation=[measured], resume=True)
+    assert (raised.value.code, raised.value.field) == ("resume_config_differs", "validation")
+
+
+@pytest.mark.parametrize("key", ["recordings", "validation"])
+def test_a_state_that_does_not_know_its_recordings_is_not_gone_on_from(
+    recordings: list[Path], tmp_path: Path, key: str
+) -> None:
+    fit(recordings, tmp_path, training=changed(TRAINING, steps=1))
+    state = load_training_state(tmp_path)
+    assert state is not None
+    tensors, record = state
+    del record[key]
+    save_training_state(tmp_path, tensors, record)
+    with pytest.raises(
+        ConfigError, match=f"expects the {key} that the run was started with, which its state does not name"
+    ) as raised:
+        fit(recordings, tmp_path, training=changed(TRAINING, steps=1), resume=True)
+    assert raised.value.code == "resume_config_differs"
+
+
+def test_the_order_of_the_recordings_does_not_matter(
+    recordings: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = fit(recordings, tmp_path / "whole")
+    with monkeypatch.context() as patch:
+        kill_at(patch, 3)
+        with pytest.raises(Killed):
+            fit(recordings, tmp_path / "killed")
+    assert digest(fit(recordings[::-1], tmp_path / "killed", resume=True)) == digest(whole)
+
+
 def test_an_existing_run_is_not_overwritten(recordings: list[Path], tmp_path: Path) -> None:
     fit(recordings, tmp_path, training=changed(TRAINING, steps=1))
     before = digest(tmp_path / STATE)
@@ -364,7 +412,7 @@ def test_validation_changes_no_weight(recordings: list[Path], measured: Path, tm
 
 
 def test_a_finished_run_is_measured_when_it_is_resumed(recordings: list[Path], measured: Path, tmp_path: Path) -> None:
-    fit(recordings, tmp_path / "run")
+    fit(recordings, tmp_path / "run", validation=[measured])
     path = fit(recordings, tmp_path / "run", validation=[measured], resume=True)
     assert load_checkpoint(path).record.provenance["metrics"]["identity_epe_px"] == 2.0
 

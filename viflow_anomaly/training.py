@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -108,10 +109,10 @@ class TrainingRun:
             return False
         tensors, record = loaded
         for key, value in fingerprint.items():
-            if record.get(key) != json.loads(json.dumps(value)):
+            before, now = record.get(key), json.loads(json.dumps(value))
+            if before != now:
                 raise ConfigError(
-                    f"{folder}: --resume expects the {key} that the run was started with, {record.get(key)}, "
-                    f"found {value}",
+                    f"{folder}: --resume expects the {key} that the run was started with, {_difference(before, now)}",
                     code="resume_config_differs",
                     field=key,
                 )
@@ -143,6 +144,16 @@ def _below(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.
     return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
 
 
+def _difference(before: object, now: object) -> str:
+    """What the error shows: both values; of lists of names, which may be hundreds long, only what one of them lacks."""
+    if not isinstance(now, list):
+        return f"{before}, found {now}"
+    if not isinstance(before, list):
+        return f"which its state does not name, found {len(now)}"
+    lost, added = ((Counter(one) - Counter(other)).elements() for one, other in ((before, now), (now, before)))
+    return f"{len(before)}, found {len(now)}: without {sorted(lost)[:5]}, with {sorted(added)[:5]}"
+
+
 def learning_rate(config: TrainingConfig, step: int) -> float:
     """Linear warm-up, then half a cosine down to a hundredth."""
     if step < config.warmup_steps:
@@ -165,7 +176,7 @@ def train(
     """Train on recordings of any known layout.
 
     Args:
-        data: recordings to learn from.
+        data: recordings to learn from, in any order: they are taken by name.
         out_dir: gets ``state.safetensors`` (exact, for resuming), ``model.safetensors`` + ``model.json``,
             ``metrics.jsonl`` and TensorBoard's ``events.*``.
         validation: recordings with ground truth to measure on, never to learn from.
@@ -185,7 +196,13 @@ def train(
     require_ground_truth(validation)
     torch.set_num_threads(training.threads)
     run = TrainingRun(model=model, training=training, device=device)
-    fingerprint = {"model": model.model_dump(mode="json"), "training": training.model_dump(mode="json")}
+    data = sorted(data, key=lambda path: (path.name, path))  # what a step draws depends on their order
+    fingerprint = {
+        "model": model.model_dump(mode="json"),
+        "training": training.model_dump(mode="json"),
+        "recordings": [path.name for path in data],
+        "validation": sorted(path.name for path in validation),
+    }
     if resume:
         run.restore(out_dir, fingerprint)
     elif (out_dir / "state.safetensors").exists():
@@ -207,7 +224,7 @@ def train(
         "training": fingerprint["training"],
         "data": {
             "recordings": len(data),
-            "names": sorted(path.name for path in data),
+            "names": fingerprint["recordings"],
             "pairs": training_data.pair_count,
             "excluded": training_data.excluded,
         },
