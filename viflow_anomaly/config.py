@@ -99,6 +99,17 @@ class ModelConfig(FrozenConfig):
     view: ViewConfig = ViewConfig()
     motion_window: MotionWindowConfig = MotionWindowConfig()
 
+    @model_validator(mode="after")
+    def _window_ends_with_the_interval(self) -> Self:
+        # The convolutional presets turn the last ``samples_between`` rows into the rotation between the frames.
+        layout = self.motion_window.layout
+        if self.preset != "paper" and layout != "resampled":
+            raise ValueError(
+                f"motion_window.layout: expected 'resampled' for the preset {self.preset!r}, found {layout!r} "
+                "(the preset 'paper' takes any)"
+            )
+        return self
+
 
 class RegionConfig(FrozenConfig):
     """From residual map to labelled regions; see ``regions.py`` for each step.
