@@ -46,8 +46,20 @@ def test_imu_takes_lists_and_whole_numbers() -> None:
 
 
 def test_imu_takes_unsigned_stamps_that_fit() -> None:
-    top = np.iinfo(np.int64).max
+    top = 2**62
     assert ImuSamples(np.array([1, top], dtype=np.uint64), ROWS[:2]).timestamps_ns[1] == top
+
+
+def test_imu_may_have_run_before_the_clocks_zero() -> None:
+    assert ImuSamples(np.array([-(2**61), -1, 5]), ROWS).timestamps_ns[0] == -(2**61)
+
+
+def test_no_difference_of_stamps_in_range_wraps() -> None:
+    camera = replace(CAMERA, time_offset_s=3600.0)
+    imu = ImuSamples(np.array([-(2**61), 2**62]), ROWS[:2])
+    source_ns = Frame(2**62, GRAY).timestamp_ns + round(camera.time_offset_s * 1e9)
+    assert (imu.timestamps_ns - source_ns).tolist() == [-(2**61) - source_ns, 2**62 - source_ns]
+    assert int(np.diff(imu.timestamps_ns)[0]) == 2**62 + 2**61
 
 
 @pytest.mark.parametrize(
@@ -61,6 +73,9 @@ def test_imu_takes_unsigned_stamps_that_fit() -> None:
         pytest.param(["1", "2", "3"], "imu_wrong_shape", id="strings"),
         pytest.param([True, False, True], "imu_wrong_shape", id="booleans"),
         pytest.param(np.array([1, 2, 2**63], dtype=np.uint64), "timestamp_out_of_range", id="beyond int64"),
+        pytest.param(np.array([1, 2, 2**62 + 1]), "timestamp_out_of_range", id="beyond 2^62"),
+        pytest.param(np.array([-(2**61) - 1, 2, 3]), "timestamp_out_of_range", id="before -2^61"),
+        pytest.param(np.array([-(2**63), 2, 3]), "timestamp_out_of_range", id="the least of int64"),
         pytest.param([10, 30, 20], "imu_unsorted", id="unsorted"),
         pytest.param([10, 20, 20], "imu_duplicate_timestamps", id="duplicate"),
     ],
@@ -69,6 +84,12 @@ def test_imu_stamps_refused(stamps: object, code: str) -> None:
     with pytest.raises(InvalidInputError) as caught:
         ImuSamples(stamps, ROWS)  # type: ignore[arg-type]
     assert code_of(caught) == (code, "imu" if code == "imu_empty" else "imu.timestamps_ns")
+
+
+@pytest.mark.parametrize(("stamps", "found"), [([-(2**63), 0, 2**62 + 1], -(2**63)), ([-1, 0, 2**62 + 1], 2**62 + 1)])
+def test_an_imu_stamp_out_of_range_is_named(stamps: list[int], found: int) -> None:
+    with pytest.raises(InvalidInputError, match=f"expected -2\\^61 to 2\\^62 nanoseconds, found {found}$"):
+        ImuSamples(np.array(stamps), ROWS)
 
 
 def test_imu_disorder_names_the_index() -> None:
@@ -213,13 +234,13 @@ def test_frame_too_small(shape: tuple[int, int]) -> None:
     Frame(1, np.zeros((32, 32), np.uint8))
 
 
-@pytest.mark.parametrize("stamp", [-1, 2**63])
+@pytest.mark.parametrize("stamp", [-1, 2**62 + 1, 2**63])
 def test_frame_stamp_out_of_range(stamp: int) -> None:
     with pytest.raises(InvalidInputError) as caught:
         Frame(stamp, GRAY)
     assert code_of(caught) == ("timestamp_out_of_range", "timestamp_ns")
     Frame(0, GRAY)
-    Frame(2**63 - 1, GRAY)
+    Frame(2**62, GRAY)
 
 
 def pair(**changes: object) -> FramePair:

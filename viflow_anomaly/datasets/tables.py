@@ -11,9 +11,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from viflow_anomaly.errors import DatasetError
-from viflow_anomaly.sensor_data import Float64Array, Int64Array
-
-MAX_TIMESTAMP_NS = 2**63 - 1
+from viflow_anomaly.sensor_data import MAX_TIMESTAMP_NS, MIN_IMU_TIMESTAMP_NS, Float64Array, Int64Array
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,11 @@ def _check_names(path: Path, first: TextLine | None, columns: Sequence[str]) -> 
 def parse_integer_ns(path: Path, line: int, cell: str, *, lowest: int = 0) -> int:
     """Nanoseconds written as an integer; a float would have lost digits already, so it is refused."""
     if not re.fullmatch(r"-?[0-9]{1,19}", cell) or not lowest <= int(cell) <= MAX_TIMESTAMP_NS:
-        raise csv_malformed(path, line, f"expected a timestamp in whole nanoseconds, found {cell[:40]!r}")
+        raise csv_malformed(
+            path,
+            line,
+            f"expected a timestamp in whole nanoseconds, {lowest} to {MAX_TIMESTAMP_NS}, found {cell[:40]!r}",
+        )
     return int(cell)
 
 
@@ -112,8 +114,7 @@ def read_stamped_numbers(path: Path, columns: Sequence[str], *, header: str) -> 
     """
     stamps, rows = [], []
     for line, cells in read_csv(path, columns, header=header):
-        # An IMU may have run before the clock's zero (odometry counts from its first frame); a frame may not.
-        stamps.append(parse_integer_ns(path, line, cells[0], lowest=-MAX_TIMESTAMP_NS))
+        stamps.append(parse_integer_ns(path, line, cells[0], lowest=MIN_IMU_TIMESTAMP_NS))
         rows.append(parse_numbers(path, line, cells[1:]))
     if not rows:
         raise csv_malformed(path, 1, f"expected rows of {', '.join(columns)}, found none")
