@@ -281,6 +281,25 @@ class TestFaults:
         )
         assert faults_of(window) == {"imu_gyro_maybe_deg_s": "lowers_trust", "imu_accel_zero": "abstain"}
 
+    @pytest.mark.parametrize(("at_s", "column", "value"), [(0.02, 4, -400.0), (-0.03, 1, 38.0)])
+    def test_a_spike_in_the_window_is_reported_and_left_in_it(self, at_s: float, column: int, value: float) -> None:
+        def struck(times_s: np.ndarray) -> np.ndarray:
+            values = at_rest(times_s)
+            values[np.isclose(times_s, at_s), column] = value
+            return values
+
+        window = build_motion_window(make_pair(regular(200), struck), SENSOR)
+        assert faults_of(window) == {"imu_spike": "lowers_trust"}
+        assert np.abs(window.values[:, column]).max() > 0.1 * abs(value)
+
+    def test_a_spike_outside_the_window_is_no_fault(self) -> None:
+        def struck(times_s: np.ndarray) -> np.ndarray:
+            values = at_rest(times_s)
+            values[np.isclose(times_s, 0.1), 4] = -400.0
+            return values
+
+        assert build_motion_window(make_pair(regular(200), struck), SENSOR).faults == ()
+
     @pytest.mark.parametrize(
         ("row", "code"),
         [([0, 0, 0, 0, 0, 1.0], "imu_accel_in_g"), ([50.0, 0, 0, 0, 0, 9.8], "imu_gyro_in_deg_s")],

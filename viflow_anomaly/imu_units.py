@@ -1,4 +1,7 @@
-"""Do the IMU's numbers look like rad/s and m/s^2? Wrong units raise where they are certain, else lower trust."""
+"""Do the IMU's numbers look like rad/s and m/s^2, and like a motion at all?
+
+Wrong units raise where they are certain, else lower trust; single samples that no motion gives lower trust.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,9 @@ GYRO_LIMIT_RAD_S = 40.0
 GYRO_SUSPICIOUS_RAD_S = 8.0
 ACCEL_LIMIT_M_S2 = 160.0
 """Above the usual full scale of MEMS accelerometers, 16 g = 157 m/s^2."""
+GYRO_SPIKE_RAD_S = 35.0
+ACCEL_SPIKE_M_S2 = 157.0
+"""2000 deg/s and 16 g: a few samples beyond are a fault of the sensor or its wiring, or a blow against it."""
 ACCEL_ZERO_M_S2 = 0.05
 ACCEL_IN_G = (0.7, 1.3)
 ACCEL_NO_GRAVITY_M_S2 = 3.0
@@ -89,3 +95,25 @@ def check_accelerometer(accel_m_s2: Float64Array) -> list[ImuFault]:
         "is in free fall."
     )
     return [ImuFault("imu_no_gravity", message, "lowers_trust")]
+
+
+def check_spikes(gyro_rad_s: Float64Array, accel_m_s2: Float64Array) -> list[ImuFault]:
+    """Single samples of [N, 3] rates (about any axis) and [N, 3] specific forces (norms) beyond any plausible motion.
+
+    They stay in the window as they are: what was measured in their place is not known.
+    """
+    fastest, hardest = np.abs(gyro_rad_s).max(axis=1), np.linalg.norm(accel_m_s2, axis=1)
+    spinning, struck = fastest > GYRO_SPIKE_RAD_S, hardest > ACCEL_SPIKE_M_S2
+    parts = []
+    if struck.any():
+        parts.append(f"the accelerometer up to {hardest.max():.0f} m/s^2 (16 g are {ACCEL_SPIKE_M_S2:.0f})")
+    if spinning.any():
+        parts.append(f"the gyroscope up to {fastest.max():.1f} rad/s (2000 deg/s are {GYRO_SPIKE_RAD_S:.0f})")
+    if not parts:
+        return []
+    message = (
+        f"{np.count_nonzero(spinning | struck)} of {len(fastest)} IMU samples are spikes beyond any plausible motion: "
+        + ", ".join(parts)
+        + "."
+    )
+    return [ImuFault("imu_spike", message, "lowers_trust")]

@@ -23,7 +23,7 @@ import numpy as np
 from viflow_anomaly.config import MotionWindowConfig
 from viflow_anomaly.errors import InvalidInputError
 from viflow_anomaly.geometry import Float32Array
-from viflow_anomaly.imu_units import ImuFault, check_accelerometer, check_gyroscope
+from viflow_anomaly.imu_units import ImuFault, check_accelerometer, check_gyroscope, check_spikes
 from viflow_anomaly.sensor_data import Float64Array, FramePair, ImuSamples, PinholeCamera
 
 MAX_COVERAGE_TOLERANCE_S = 0.020
@@ -90,6 +90,7 @@ def build_motion_window(pair: FramePair, config: MotionWindowConfig) -> MotionWi
     faults = [
         *check_gyroscope(signal.values[:, :3]),
         *check_accelerometer(signal.values[:, 3:]),
+        *check_spikes(signal.values[:, :3], signal.values[:, 3:]),
         *_check_interval(interval_s),
         *_check_rate(signal.times_s, interval_s),
         *_check_gaps(signal.times_s, before_s, interval_s),
