@@ -23,10 +23,11 @@ COVERAGE_FLOOR ?= 90
 MODEL_DIR ?= runs/model
 MODEL_SEQUENCES ?= 360
 MODEL_FRAMES ?= 32
-MODEL_STEPS ?= 4800
+MODEL_STEPS ?= 20000
 MODEL_JOBS ?= 2
-MODEL_THREADS ?= 2
-MODEL_TRAINING := --set training.learning_rate=0.0015 --set training.warmup_steps=200
+MODEL_THREADS ?= 1
+MODEL_TRAINING := --set model.preset=calibrated --set training.learning_rate=0.0015 --set training.warmup_steps=200 \
+  --set training.validate_every=4000
 HELD_OUT_SEQUENCES ?= 12
 HELD_OUT_FRAMES ?= 20
 
@@ -46,7 +47,7 @@ $(VENV)/.torch: constraints.txt
 	@touch $@
 
 $(VENV)/.installed: $(VENV)/.torch pyproject.toml
-	$(PIP) install --quiet --editable .
+	$(PIP) install --quiet --editable '.[openvino]'
 	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
@@ -81,8 +82,8 @@ model: held-out
 	validation=; for folder in $(MODEL_DIR)/held-out/*_9?000[0-5]; do validation+=" --validation $$folder"; done; \
 	$(BIN)/viflow-anomaly train $(MODEL_DIR)/train/* $$validation --out $(MODEL_DIR)/run --resume \
 	  --steps $(MODEL_STEPS) --threads $(MODEL_THREADS) $(MODEL_TRAINING)
-	cp $(MODEL_DIR)/run/model.safetensors viflow_anomaly/weights/viflow-compact.safetensors
-	cp $(MODEL_DIR)/run/model.json viflow_anomaly/weights/viflow-compact.json
+	$(BIN)/viflow-anomaly export --checkpoint $(MODEL_DIR)/run/model.safetensors
+	for kind in safetensors json onnx; do cp $(MODEL_DIR)/run/model.$$kind viflow_anomaly/weights/viflow-calibrated.$$kind; done
 	$(MAKE) --no-print-directory evaluate
 
 held-out: $(VENV)/.installed-dev

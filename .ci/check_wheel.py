@@ -20,7 +20,7 @@ def problems(wheel: zipfile.ZipFile) -> list[str]:
     sizes = {entry.filename: entry.file_size for entry in wheel.infolist()}
     found = [f"missing {name}" for name in REQUIRED if name not in sizes]
     weights = {name: size for name, size in sizes.items() if name.startswith("viflow_anomaly/weights/")}
-    total = sum(size for name, size in weights.items() if name.endswith(".safetensors"))
+    total = sum(size for name, size in weights.items() if name.endswith((".safetensors", ".onnx")))
     if not 0 < total <= MAX_WEIGHTS_BYTES:
         found.append(f"expected bundled weights of at most {MAX_WEIGHTS_BYTES} bytes, found {total}")
     if not any(name.endswith(".md") for name in weights):

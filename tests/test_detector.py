@@ -26,6 +26,7 @@ from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples, PinholeCame
 WIDTH, HEIGHT, FOCAL_PX = 320, 256, 232.0
 INTERVAL_NS = 50_000_000
 SOURCE_NS = 1_000_000_000
+COMPACT = ModelConfig(preset="compact")
 PATCH = (slice(90, 140), slice(180, 230))  # rows, columns
 
 
@@ -63,13 +64,13 @@ def turned(image: Uint8Array, rate: tuple[float, float, float]) -> Uint8Array:
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A network that predicts the gyro's rotation and nothing else: its learned heads are zero."""
-    network = build_model(ModelConfig())
+    network = build_model(COMPACT)
     assert isinstance(network, CompactViflow)
     with torch.no_grad():
         for head in (network.global_head, network.local_head):
             head.weight.zero_()
     path = tmp_path_factory.mktemp("weights") / "rotation.safetensors"
-    return save_checkpoint(path, network, ModelConfig(), name="rotation", version="0")
+    return save_checkpoint(path, network, COMPACT, name="rotation", version="0")
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ from viflow_anomaly.training import TrainingRun, learning_rate, train
 from viflow_anomaly.training_data import TrainingData, load_training_data
 
 WINDOW = MotionWindowConfig(samples_before=2, samples_between=4)
-MODEL = ModelConfig(hypotheses=4, view=ViewConfig(focal_px=80.0), motion_window=WINDOW)
+MODEL = ModelConfig(preset="compact", hypotheses=4, view=ViewConfig(focal_px=80.0), motion_window=WINDOW)
 MEASURES = {"epe_px", "predicted_epe_px", "identity_epe_px", "epe_ratio", "predicted_epe_ratio"}
 TRAINING = TrainingConfig(steps=6, batch_size=2, warmup_steps=2, checkpoint_every=1, validate_every=3)
 STATE = "state.safetensors"

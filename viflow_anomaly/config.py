@@ -94,7 +94,7 @@ class MotionWindowConfig(FrozenConfig):
 class ModelConfig(FrozenConfig):
     """What the builder needs to make a network; saved in its checkpoint."""
 
-    preset: Literal["paper", "compact", "calibrated"] = "compact"
+    preset: Literal["paper", "compact", "calibrated"] = "calibrated"
     hypotheses: Literal[1, 4, 8] = 8
     view: ViewConfig = ViewConfig()
     motion_window: MotionWindowConfig = MotionWindowConfig()

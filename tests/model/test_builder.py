@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import pytest
 import torch
 
 from viflow_anomaly.config import ModelConfig, MotionWindowConfig, ViewConfig
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.model.builder import build_model
+from viflow_anomaly.model.calibrated import CalibratedViflow
 from viflow_anomaly.model.compact import CompactViflow
+from viflow_anomaly.model.layers import ConvolutionalViflow
 from viflow_anomaly.model.paper import PaperViflow
 
 
@@ -24,10 +28,14 @@ def test_the_global_generator_is_left_alone() -> None:
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_compact_is_built_as_configured() -> None:
+@pytest.mark.parametrize(("preset", "kind"), [("compact", CompactViflow), ("calibrated", CalibratedViflow)])
+def test_a_convolutional_preset_is_built_as_configured(
+    preset: Literal["compact", "calibrated"], kind: type[ConvolutionalViflow]
+) -> None:
     window = MotionWindowConfig(samples_before=2, samples_between=6)
-    network = build_model(ModelConfig(hypotheses=4, motion_window=window, view=ViewConfig(focal_px=100.0)))
-    assert isinstance(network, CompactViflow)
+    config = ModelConfig(preset=preset, hypotheses=4, motion_window=window, view=ViewConfig(focal_px=100.0))
+    network = build_model(config)
+    assert isinstance(network, kind)
     assert (network.hypotheses, network.focal_px) == (4, 100.0)
     with torch.no_grad():
         flow = network(torch.rand(1, 1, 32, 32), torch.zeros(1, 8, 6), torch.tensor([0.1])).flow_px

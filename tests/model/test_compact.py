@@ -15,7 +15,7 @@ from viflow_anomaly.losses import photometric_loss
 from viflow_anomaly.model.builder import build_model
 from viflow_anomaly.model.compact import QUADRATIC_PARAMETERS, CompactViflow
 
-CONFIG = ModelConfig()
+CONFIG = ModelConfig(preset="compact")
 MAX_WEIGHTS_BYTES = 8 * 1024 * 1024
 
 

@@ -55,14 +55,13 @@ class OpenvinoRuntime:
         """All hypotheses of one pair."""
         window = model_input.window
         request = self._request(model_input.source.shape)
-        request.infer(
-            {
-                "source": model_input.source[None, None].astype(np.float32) * np.float32(1 / 255),
-                "motion": window.values[None],
-                "interval_s": np.array([window.interval_s], dtype=np.float32),
-            },
-            share_inputs=True,
-        )
+        inputs = {
+            "source": model_input.source[None, None].astype(np.float32) * np.float32(1 / 255),
+            "motion": window.values[None],
+            "interval_s": np.array([window.interval_s], dtype=np.float32),
+        }
+        wanted = [port.get_any_name() for port in request.model_inputs]  # an export drops what its network ignores
+        request.infer({name: inputs[name] for name in wanted}, share_inputs=True)
         flow_px = np.ascontiguousarray(request.get_tensor("flow_px").data[0].transpose(0, 2, 3, 1))
         names = request.model_outputs
         if len(names) == 1:

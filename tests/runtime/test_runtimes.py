@@ -1,0 +1,179 @@
+"""Every runtime answers as torch does, and says clearly why it cannot run."""
+
+from __future__ import annotations
+
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+from worlds import make_world, textured_image
+
+from viflow_anomaly.checkpoint import save_checkpoint
+from viflow_anomaly.config import ModelConfig, MotionWindowConfig, RuntimeName, ViewConfig
+from viflow_anomaly.detection import to_json
+from viflow_anomaly.detector import AnomalyDetector
+from viflow_anomaly.errors import CheckpointError, ConfigError
+from viflow_anomaly.model.builder import build_model
+from viflow_anomaly.model_input import ModelInput, prepare
+from viflow_anomaly.runtime import loading
+from viflow_anomaly.runtime.export import export_onnx
+from viflow_anomaly.runtime.loading import load_runtime
+from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples
+
+pytest.importorskip("openvino", reason="the extra 'openvino' is not installed")
+pytest.importorskip("onnxscript", reason="the extra 'export' is not installed")
+
+MAX_FLOW_DIFFERENCE_PX = 1e-3
+PRESETS: list[Literal["compact", "calibrated"]] = ["compact", "calibrated"]
+
+
+def save(folder: Path, preset: Literal["paper", "compact", "calibrated"], **more: object) -> Path:
+    config = ModelConfig.model_validate({"preset": preset, "hypotheses": 4, **more})
+    path = folder / f"{preset}.safetensors"
+    return save_checkpoint(path, build_model(config, seed=2), config, name=preset, version="3")
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("exported")
+    paths = {preset: save(folder, preset) for preset in PRESETS}
+    for path in paths.values():
+        assert export_onnx(path) == path.with_suffix(".onnx")
+    return paths
+
+
+def frame_pair(height: int = 128, width: int = 192) -> FramePair:
+    world = make_world()
+    imu = ImuSamples(world.imu.timestamps_ns, world.imu.gyro_rad_s + 0.2, world.imu.accel_m_s2)
+    images = [textured_image(width, height, seed=seed) for seed in (1, 1)]
+    images[1] = np.roll(images[1], 2, axis=1)
+    frames = [Frame(int(world.frame_timestamps_ns[k]), image) for k, image in zip((1, 2), images, strict=True)]
+    return FramePair(frames[0], frames[1], imu, None)
+
+
+def model_input(height: int, width: int) -> ModelInput:
+    return prepare(frame_pair(height, width), ModelConfig())
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize(("height", "width"), [(128, 192), (128, 128), (64, 96), (33, 65)])
+def test_openvino_gives_torchs_flow(exported: dict[str, Path], preset: str, height: int, width: int) -> None:
+    one = model_input(height, width)
+    reference = load_runtime(exported[preset], runtime="torch").runtime
+    fast = load_runtime(exported[preset], runtime="openvino").runtime
+    assert (reference.name, fast.name) == ("torch", "openvino")
+    expected, found = reference.predict(one), fast.predict(one)
+    assert found.stride == expected.stride
+    np.testing.assert_allclose(found.flow_px, expected.flow_px, atol=MAX_FLOW_DIFFERENCE_PX)
+    assert (found.scene is None) == (expected.scene is None) == (preset == "compact")
+    if found.scene is not None and expected.scene is not None:
+        for ours, theirs in zip(found.scene, expected.scene, strict=True):
+            np.testing.assert_allclose(ours, theirs, atol=1e-4)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_the_detections_are_the_same(exported: dict[str, Path], preset: str) -> None:
+    runtimes: tuple[RuntimeName, ...] = ("torch", "openvino")
+    detectors = [AnomalyDetector.from_checkpoint(exported[preset], runtime=name) for name in runtimes]
+    first, second = (detector.detect(frame_pair()) for detector in detectors)
+    assert [roi.bbox for roi in first.rois] == [roi.bbox for roi in second.rois]
+    assert [roi.label for roi in first.rois] == [roi.label for roi in second.rois]
+    assert first.model == second.model
+
+
+def test_auto_takes_openvino_where_there_is_an_export(exported: dict[str, Path], tmp_path: Path) -> None:
+    assert load_runtime(exported["compact"]).runtime.name == "openvino"
+    assert load_runtime(save(tmp_path, "compact")).runtime.name == "torch"
+
+
+def test_auto_takes_torch_where_openvino_is_missing(exported: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loading, "find_spec", lambda _: None)
+    assert load_runtime(exported["compact"]).runtime.name == "torch"
+    with pytest.raises(ConfigError, match=r"pip install 'viflow-anomaly\[openvino\]'") as caught:
+        load_runtime(exported["compact"], runtime="openvino")
+    assert caught.value.code == "runtime_unavailable"
+
+
+def test_openvino_without_an_export_or_on_another_device_is_refused(exported: dict[str, Path], tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="viflow-anomaly export") as caught:
+        load_runtime(save(tmp_path, "compact"), runtime="openvino")
+    assert caught.value.code == "runtime_unavailable"
+    with pytest.raises(ConfigError, match="expected the device 'cpu'") as caught:
+        load_runtime(exported["compact"], runtime="openvino", device="cuda")
+    assert caught.value.code == "runtime_unavailable"
+
+
+def test_an_export_of_other_weights_is_refused(exported: dict[str, Path], tmp_path: Path) -> None:
+    path = save(tmp_path, "compact")
+    path.with_suffix(".onnx").write_bytes(exported["calibrated"].with_suffix(".onnx").read_bytes())
+    with pytest.raises(CheckpointError, match="expected an export of the weights") as caught:
+        load_runtime(path)
+    assert caught.value.code == "checkpoint_corrupt"
+
+
+@pytest.mark.parametrize("content", [b"", b"no network", b"\x80\x04pickle"])
+def test_a_file_that_is_no_network_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = save(tmp_path, "compact")
+    path.with_suffix(".onnx").write_bytes(content)
+    with pytest.raises(CheckpointError) as caught:
+        load_runtime(path)
+    assert caught.value.code == "checkpoint_corrupt"
+
+
+def test_a_truncated_export_is_refused(exported: dict[str, Path], tmp_path: Path) -> None:
+    path = save(tmp_path, "compact")
+    whole = exported["compact"].with_suffix(".onnx").read_bytes()
+    path.with_suffix(".onnx").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(CheckpointError) as caught:
+        load_runtime(path)
+    assert caught.value.code == "checkpoint_corrupt"
+
+
+def test_threads_share_a_runtime_and_get_the_serial_answers(exported: dict[str, Path]) -> None:
+    detector = AnomalyDetector.from_checkpoint(exported["calibrated"], runtime="openvino")
+    pairs = [frame_pair(height, 128) for height in (64, 96, 128)] * 4
+    serial = [to_json(replace(detector.detect(one), timings_ms={})) for one in pairs]
+    with ThreadPoolExecutor(4) as pool:
+        threaded = [to_json(replace(one, timings_ms={})) for one in pool.map(detector.detect, pairs)]
+    assert threaded == serial
+
+
+def test_more_sizes_than_are_kept_work(exported: dict[str, Path]) -> None:
+    runtime = load_runtime(exported["compact"], runtime="openvino").runtime
+    inputs = [model_input(64, width) for width in range(33, 33 + 32 * 5, 16)] * 2
+    answers = [runtime.predict(one).flow_px.sum() for one in inputs]
+    np.testing.assert_array_equal(answers[:10], answers[10:])
+
+
+def test_the_same_checkpoint_gives_the_same_export(exported: dict[str, Path], tmp_path: Path) -> None:
+    again = export_onnx(exported["calibrated"], tmp_path / "again.onnx")
+    assert again.read_bytes() == exported["calibrated"].with_suffix(".onnx").read_bytes()
+
+
+def test_the_paper_preset_is_exported_at_its_own_size(tmp_path: Path) -> None:
+    path = save(
+        tmp_path,
+        "paper",
+        view=ViewConfig(mode="center_crop", crop_size=32).model_dump(),
+        motion_window=MotionWindowConfig(samples_before=1, samples_between=2).model_dump(),
+    )
+    export_onnx(path)
+    record = load_runtime(path, runtime="torch").record
+    one = prepare(frame_pair(40, 50), record.model)
+    expected = load_runtime(path, runtime="torch").runtime.predict(one).flow_px
+    found = load_runtime(path, runtime="openvino").runtime.predict(one).flow_px
+    assert found.shape == (4, 32, 32, 2)
+    np.testing.assert_allclose(found, expected, atol=MAX_FLOW_DIFFERENCE_PX)
+
+
+def test_without_onnx_nothing_is_exported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = save(tmp_path, "compact")
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(ConfigError, match=r"viflow-anomaly\[export\]") as caught:
+        export_onnx(path)
+    assert caught.value.code == "export_unavailable"
+    assert not path.with_suffix(".onnx").exists()
