@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,11 +8,14 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from worlds import make_world, write_euroc, write_plain
+from worlds import make_world, textured_image, write_euroc, write_plain, write_png
 
+from viflow_anomaly import training_data
 from viflow_anomaly.batch import Batch
 from viflow_anomaly.config import ModelConfig, MotionWindowConfig, ViewConfig
-from viflow_anomaly.errors import DatasetError
+from viflow_anomaly.datasets.recording import Recording
+from viflow_anomaly.datasets.registry import open_recording
+from viflow_anomaly.errors import DatasetError, InvalidInputError
 from viflow_anomaly.geometry import rigid_motion_flow
 from viflow_anomaly.losses import warp
 from viflow_anomaly.sensor_data import PinholeCamera
@@ -86,6 +90,77 @@ def test_unusable_pairs_are_counted_by_code(tmp_path: Path) -> None:
     assert data.excluded == {"imu_gap": 1, "imu_not_covering": 1}
     assert data.pair_count == 2
     assert data.buckets[0].pairs.tolist() == [[0, 1], [2, 3]]
+
+
+def cut_short(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def of_another_size(path: Path) -> None:
+    write_png(path, textured_image(128, 64))
+
+
+@pytest.mark.parametrize("measure", [False, True])
+@pytest.mark.parametrize("spoilt", [0, 2])
+@pytest.mark.parametrize(
+    ("spoil", "code"),
+    [
+        (cut_short, "image_truncated_or_corrupt"),
+        (Path.unlink, "image_missing"),
+        (of_another_size, "image_sizes_differ"),
+    ],
+)
+def test_a_spoilt_frame_excludes_only_its_pairs(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    spoil: Callable[[Path], None],
+    code: str,
+    spoilt: int,
+    measure: bool,
+) -> None:
+    folder = write_plain(tmp_path / "a", make_world(frames=5))
+
+    def opened(path: Path) -> Recording:
+        recording = open_recording(path)
+        spoil(recording.frame_path(spoilt))  # between the opening and the reading: a missing file ends the former
+        return recording
+
+    monkeypatch.setattr(training_data, "open_recording", opened)
+    data = load_training_data([folder], CONFIG, (1,), measure=measure)
+    kept = [pair for pair in [(0, 1), (1, 2), (2, 3), (3, 4)] if spoilt not in pair]
+    (bucket,) = data.buckets
+    assert data.excluded == {code: 4 - len(kept)}
+    assert bucket.frames.shape == (len({frame for pair in kept for frame in pair}), 64, 96)
+    monkeypatch.undo()
+    whole = load(write_plain(tmp_path / "b", make_world(frames=5))).buckets[0]
+    for (source, target), wanted in zip(bucket.pairs, kept, strict=True):
+        np.testing.assert_array_equal(bucket.frames[[source, target]], whole.frames[list(wanted)])
+
+
+def test_frames_of_two_sizes_without_a_camera_are_two_buckets(tmp_path: Path) -> None:
+    folder = write_plain(tmp_path / "a", make_world(frames=5), camera=False)
+    for index in (0, 1):
+        of_another_size(folder / f"images/{index:04d}.png")
+    data = load(folder)
+    assert [bucket.frames.shape for bucket in data.buckets] == [(3, 64, 96), (2, 64, 128)]
+    assert data.excluded == {"image_sizes_differ": 1}
+
+
+def test_frames_that_do_not_fit_the_camera_are_excluded(tmp_path: Path) -> None:
+    folder = write_plain(tmp_path / "a", make_world(frames=5))
+    for index in (0, 1):
+        of_another_size(folder / f"images/{index:04d}.png")
+    data = load(folder)
+    assert data.excluded == {"camera_size_mismatch": 1, "image_sizes_differ": 1}
+    assert data.pair_count == 2
+
+
+def test_a_camera_that_cannot_be_used_is_said_at_once(tmp_path: Path) -> None:
+    world = make_world(frames=2)
+    folded = replace(world.camera, distortion_model="radtan", distortion_coeffs=(-50.0, 20.0, 0.0, 0.0))
+    with pytest.raises(InvalidInputError) as raised:
+        load(write_plain(tmp_path / "a", replace(world, camera=folded)))
+    assert raised.value.code == "camera_invalid"
 
 
 def test_no_usable_pair_is_an_error_that_says_why(tmp_path: Path) -> None:

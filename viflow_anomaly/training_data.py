@@ -1,4 +1,4 @@
-"""Recordings in memory, ready for training: every frame rendered once to its view, every pair with its window."""
+"""Recordings in memory, ready for training: every frame in use rendered once to its view, pairs with their windows."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from viflow_anomaly.batch import Batch, collate_arrays
 from viflow_anomaly.config import ModelConfig
 from viflow_anomaly.datasets.pairing import RecordingPairs
+from viflow_anomaly.datasets.recording import Recording
 from viflow_anomaly.datasets.registry import open_recording
-from viflow_anomaly.errors import DatasetError, InvalidInputError
+from viflow_anomaly.errors import DatasetError, InvalidInputError, ViflowError
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.measured_flow import MeasuredFlow, measure_flow
 from viflow_anomaly.model.layers import FLOW_STRIDE
@@ -115,6 +116,7 @@ def load_training_data(
 
     Raises:
         DatasetError: as ``open_recording``; ``training_data_empty`` when no pair is left.
+        InvalidInputError: as ``make_view`` for the camera of a whole recording.
     """
     buckets: dict[tuple[int, int], _Growing] = defaultdict(lambda: _Growing([], [], [], [], [], []))
     excluded: Counter[str] = Counter()
@@ -145,40 +147,55 @@ def _add_recording(
     recording = open_recording(path)
     pairs = RecordingPairs(recording, look_aheads)
     camera = recording.camera
-    images = [recording.frame(index).image for index in range(len(recording))]
-    height, width = images[0].shape
-    view = make_view(config.view, width=width, height=height, camera=camera)
-    bucket = buckets[view.height, view.width]
-    first = len(bucket.frames)
-    bucket.frames += [view.render(image) for image in images]
-    stamps = recording.frame_timestamps_ns
+    if camera is not None:  # one that cannot be used would exclude every pair: said at once instead
+        make_view(config.view, width=camera.width, height=camera.height, camera=camera)
     in_camera_axes = config.motion_window.axes == "camera" and camera is not None and camera.T_cam_imu is not None
-    for index, (source, target) in enumerate(pairs.indices):
+    frames = [_read(recording, index) for index in range(len(recording))]
+    places: dict[int, int] = {}  # of the frames of usable pairs in their bucket
+    for index, indices in enumerate(pairs.indices):
         try:
-            window = build_motion_window(
-                FramePair(
-                    source=Frame(int(stamps[source]), images[source]),
-                    target=Frame(int(stamps[target]), images[target]),
-                    imu=pairs.imu(index),
-                    camera=camera,
-                ),
-                config.motion_window,
-            )
+            source, target = (_require(frames[one]) for one in indices)
+            pair = FramePair(source, target, pairs.imu(index), camera)
+            window = _require_judgeable(build_motion_window(pair, config.motion_window))
+            height, width = source.image.shape
+            view = make_view(config.view, width=width, height=height, camera=camera)
         except InvalidInputError as err:
             excluded[err.code] += 1
             continue
-        abstained = next((fault.code for fault in window.faults if fault.severity == "abstain"), None)
-        if abstained is not None:
-            excluded[abstained] += 1
-            continue
-        bucket.pairs.append((first + source, first + target))
+        bucket = buckets[view.height, view.width]
+        for one, frame in zip(indices, (source, target), strict=True):
+            if one not in places:
+                places[one] = len(bucket.frames)
+                bucket.frames.append(view.render(frame.image))
+        bucket.pairs.append((places[indices[0]], places[indices[1]]))
         bucket.windows.append(window)
         bucket.mirrorable.append(in_camera_axes)
         if measure:
-            views = (bucket.frames[first + one] for one in (source, target))
+            views = (bucket.frames[place] for place in bucket.pairs[-1])
             measured = measure_flow(*views, stride=FLOW_STRIDE)
             bucket.measured_px.append(measured.flow_px.astype(np.float16))
             bucket.confidence.append((measured.confidence * 255).astype(np.uint8))
+
+
+def _read(recording: Recording, index: int) -> Frame | ViflowError:
+    """A frame, or why it cannot be read: that excludes its pairs only."""
+    try:
+        return recording.frame(index)
+    except (InvalidInputError, DatasetError) as err:
+        return err
+
+
+def _require(frame: Frame | ViflowError) -> Frame:
+    if isinstance(frame, Frame):
+        return frame
+    raise InvalidInputError(frame.message, code=frame.code, field=frame.field)
+
+
+def _require_judgeable(window: MotionWindow) -> MotionWindow:
+    for fault in window.faults:
+        if fault.severity == "abstain":
+            raise InvalidInputError(fault.message, code=fault.code, field="imu")
+    return window
 
 
 def _finished(bucket: _Growing) -> PairBucket:
