@@ -13,7 +13,8 @@ from viflow_anomaly.geometry import pixel_grid, project_rays, unproject_pixels
 from viflow_anomaly.sensor_data import DistortionModel, PinholeCamera
 from viflow_anomaly.view import SIDE_MULTIPLE_PX, InternalView, make_view
 
-WHOLE = ViewConfig()
+# Steps of 1, 2 and 3 for the sizes below, whatever the defaults are.
+WHOLE = ViewConfig(focal_px=232.0, max_width=416, max_height=416, max_pinhole_width=640, max_pinhole_height=512)
 CROP = ViewConfig(mode="center_crop")
 STRIDES = (1, 4)
 TOLERANCE_PX = 0.05
