@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple, Self
 
+import cv2
 import numpy as np
 
 from viflow_anomaly.checkpoint_record import CheckpointRecord
@@ -22,7 +23,7 @@ from viflow_anomaly.detection import (
 )
 from viflow_anomaly.geometry import Float32Array, pixel_grid
 from viflow_anomaly.model_input import ModelInput, prepare
-from viflow_anomaly.prediction import predict_flow
+from viflow_anomaly.prediction import PredictedFlow, predict_flow
 from viflow_anomaly.regions import find_regions
 from viflow_anomaly.residual import photometric_residual, reconstruct
 from viflow_anomaly.runtime.interface import Runtime
@@ -44,15 +45,20 @@ class Analysis(NamedTuple):
         detection: what ``detect`` returns.
         residual: [H, W] float32 photometric residual in gray levels at the source image's size.
         reconstruction: [H, W] float32 source image rebuilt from the target.
-        flow_px: [H, W, 2] float32 flow of the winning hypothesis in source pixels.
-        hypothesis: its index.
+        target_coordinates: [H, W, 2] float32 where each source pixel is predicted in the target image.
+        predicted: the flow they come from, in the network's view, and its correction.
     """
 
     detection: Detection
     residual: Float32Array
     reconstruction: Float32Array
-    flow_px: Float32Array
-    hypothesis: int
+    target_coordinates: Float32Array
+    predicted: PredictedFlow
+
+    @property
+    def flow_px(self) -> Float32Array:
+        """[H, W, 2] float32 flow of the static world in source pixels."""
+        return self.target_coordinates - pixel_grid(*self.residual.shape)
 
 
 class AnomalyDetector:
@@ -156,16 +162,17 @@ class AnomalyDetector:
             residual=summary,
             timings_ms=timings_ms,
         )
-        flow_px = coordinates - pixel_grid(height, width)
-        return Analysis(detection, residual, reconstruction, flow_px, predicted.hypothesis)
+        return Analysis(detection, residual, reconstruction, coordinates, predicted)
 
     def _judge_input(self, pair: FramePair, model_input: ModelInput) -> tuple[tuple[Reason, ...], bool]:
         """What lowers trust in this pair, and whether it must not be judged."""
         faults = model_input.window.faults
         reasons = [Reason(code=fault.code, message=fault.message) for fault in faults]
         abstained = any(fault.severity == "abstain" for fault in faults)
-        source, target = (image[::4, ::4] for image in (pair.source.image, pair.target.image))
-        texture = min(float(source.std()), float(target.std()))
+        (source_mean, source_texture), (target_mean, target_texture) = (
+            (float(value[0, 0]) for value in cv2.meanStdDev(image)) for image in (pair.source.image, pair.target.image)
+        )
+        texture = min(source_texture, target_texture)
         if texture < self.config.min_texture_gray:
             reasons.append(
                 Reason(
@@ -175,7 +182,7 @@ class AnomalyDetector:
                 )
             )
             abstained = True
-        jump = abs(float(source.mean()) - float(target.mean()))
+        jump = abs(source_mean - target_mean)
         if jump > self.config.max_exposure_jump_gray:
             reasons.append(
                 Reason(
@@ -192,5 +199,8 @@ def _summary(residual: Float32Array, inside: np.ndarray[tuple[int, ...], np.dtyp
     values = residual[thin][inside[thin]]
     if not values.size:
         return None
-    median, p95 = np.percentile(values, (50, 95))
-    return ResidualSummary(mean=float(values.mean()), median=float(median), p95=float(p95))
+    mean = float(values.mean())
+    ranks = [int(share * (values.size - 1)) for share in (0.5, 0.95)]
+    values.partition(ranks)
+    median, p95 = (float(values[rank]) for rank in ranks)
+    return ResidualSummary(mean=mean, median=median, p95=p95)
