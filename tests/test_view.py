@@ -168,12 +168,22 @@ def test_a_ramp_is_seen_where_it_is(
     assert np.abs(difference_px).max() * slope < 1.1
 
 
+def covered(view: InternalView) -> NDArray[np.bool_]:
+    """[h, w]: view pixels that show the source image rather than its repeated border."""
+    if view.lens is not None:
+        source = view.lens.source_of_view
+    else:
+        source = (pixel_grid(view.height, view.width) - view.middle_px) * view.step_px + view.center_px
+    low, high = -0.5, np.array([view.source_width, view.source_height]) - 0.5
+    return np.asarray(((source >= low) & (source <= high)).all(axis=-1))
+
+
 def inner_part(view: InternalView) -> NDArray[np.bool_]:
     """View pixels that show the source image, without those next to its border."""
-    covered = view.covered()
-    inner = covered.copy()
-    inner[1:], inner[:-1] = inner[1:] & covered[:-1], inner[:-1] & covered[1:]
-    inner[:, 1:], inner[:, :-1] = inner[:, 1:] & covered[:, :-1], inner[:, :-1] & covered[:, 1:]
+    seen = covered(view)
+    inner = seen.copy()
+    inner[1:], inner[:-1] = inner[1:] & seen[:-1], inner[:-1] & seen[1:]
+    inner[:, 1:], inner[:, :-1] = inner[:, 1:] & seen[:, :-1], inner[:, :-1] & seen[:, 1:]
     return inner
 
 
@@ -208,23 +218,22 @@ def test_sides_are_multiples_of_32(width: int, height: int, with_camera: bool) -
     np.testing.assert_allclose(target, pixel_grid(height, width), atol=TOLERANCE_PX)
 
 
-def test_covered_tells_the_image_from_its_repeated_border() -> None:
-    view = make_view(WHOLE, width=65, height=65, camera=None)
-    covered = view.covered()
-    assert (view.width, view.height) == (64, 64)
-    assert covered.all()
-    padded = make_view(WHOLE, width=50, height=40, camera=None)
-    assert (padded.width, padded.height) == (64, 64)
-    assert np.count_nonzero(padded.covered()) == 50 * 40
-    assert padded.covered()[12:52, 7:57].all()
+def test_what_lies_beyond_the_image_repeats_its_border() -> None:
+    full, padded = (make_view(WHOLE, width=width, height=height, camera=None) for width, height in ((65, 65), (50, 40)))
+    assert (full.width, full.height) == (padded.width, padded.height) == (64, 64)
+    assert covered(full).all()
+    assert np.count_nonzero(covered(padded)) == 50 * 40
+    assert covered(padded)[12:52, 7:57].all()
+    image = textured_image(50, 40)
+    np.testing.assert_array_equal(padded.render(image), np.pad(image, ((12, 12), (7, 7)), mode="edge"))
 
 
-def test_covered_through_a_lens_matches_what_the_lens_sees() -> None:
+def test_the_lens_shows_what_the_closed_form_says() -> None:
     view = make_view(WHOLE, width=752, height=480, camera=EUROC)
     at = source_pixels(view, EUROC, pixel_grid(view.height, view.width).astype(np.float64))
     expected = ((at >= -0.5) & (at <= (751.5, 479.5))).all(axis=-1)
-    assert np.count_nonzero(view.covered() != expected) <= 4
-    assert 0.5 < view.covered().mean() < 1.0
+    assert np.count_nonzero(covered(view) != expected) <= 4
+    assert 0.5 < covered(view).mean() < 1.0
 
 
 def test_the_same_camera_gives_the_same_view_object() -> None:

@@ -1,9 +1,11 @@
-"""SO(3), pinhole projection and rigid motion fields in numpy. Pixel centres lie at integer coordinates.
+"""SO(3), pinhole projection, sampling and rigid motion fields in numpy. Pixel centres lie at integer coordinates.
 
 Frames: camera x right, y down, z forward. ``T_a_b`` maps coordinates in b to a.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import cv2
 import numpy as np
@@ -48,6 +50,13 @@ def pixel_grid(height: int, width: int) -> Float32Array:
     """[H, W, 2] of (u, v) pixel-centre coordinates."""
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     return np.stack([u, v], axis=-1)
+
+
+def sample_bilinear(array: NDArray[Any], at_px: Float32Array) -> NDArray[Any]:
+    """Bilinear samples of [H, W(, C)] at [h, w, 2] pixel coordinates; the border is repeated."""
+    return cv2.remap(  # type: ignore[call-overload, no-any-return]  # the stubs lack the two-channel map
+        array, at_px, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
 
 
 def _distort(

@@ -20,40 +20,12 @@ from numpy.typing import NDArray
 
 from viflow_anomaly.config import ViewConfig
 from viflow_anomaly.errors import InvalidInputError, TooLargeError
-from viflow_anomaly.geometry import Float32Array, pixel_grid, project_rays, unproject_pixels
-from viflow_anomaly.sensor_data import DistortionModel, Float64Array, PinholeCamera, Uint8Array
+from viflow_anomaly.geometry import Float32Array, pixel_grid, sample_bilinear, unproject_pixels
+from viflow_anomaly.lens import LensMaps, lattice_rays, solve_lens_maps
+from viflow_anomaly.sensor_data import DistortionModel, PinholeCamera, Uint8Array
 
 SIDE_MULTIPLE_PX = 32
-LENS_LATTICE_PX = 8
-"""Lens maps are solved on a lattice of 8 source pixels and interpolated: the error stays below 0.03 px."""
 MAX_SIDE_PX = 32767
-MAX_ROUND_TRIP_PX = 1.0
-"""A lens is understood where undoing and redoing its distortion comes back this close."""
-
-
-@dataclass(frozen=True, eq=False)
-class _LensMaps:
-    """Lookup tables of a distorted camera.
-
-    Attributes:
-        camera: whose distortion they undo.
-        source_of_view: [h, w, 2] source pixel of every view pixel.
-        view_of_source: [H, W, 2] view pixel of every source pixel.
-    """
-
-    camera: PinholeCamera
-    source_of_view: Float32Array
-    view_of_source: Float32Array
-
-    def distorted_flow(self, view: InternalView, flow_view_px: Float32Array, stride: int) -> Float32Array:
-        """Flow of the ideal view [h', w', 2] -> flow in distorted source pixels at the same cells."""
-        height, width = flow_view_px.shape[:2]
-        offset = (pixel_grid(height, width) + np.float32(0.5)) * np.float32(stride) - np.float32(0.5)
-        from_middle = (offset - np.array(view.middle_px, dtype=np.float32)).astype(np.float32)
-        to_ray = np.array(view.step_px, dtype=np.float32) / np.array((self.camera.fx, self.camera.fy), dtype=np.float32)
-        source = project_rays(self.camera, (from_middle * to_ray).astype(np.float32))
-        target = project_rays(self.camera, ((from_middle + flow_view_px) * to_ray).astype(np.float32))
-        return np.asarray(target - source, dtype=np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +48,7 @@ class InternalView:
     source_height: int
     step_px: tuple[float, float]
     center_px: tuple[float, float]
-    lens: _LensMaps | None = None
+    lens: LensMaps | None = None
 
     @property
     def middle_px(self) -> tuple[float, float]:
@@ -94,22 +66,13 @@ class InternalView:
             )
         if self.lens is not None:
             at_px = (self.lens.source_of_view + np.float32(0.5)) / np.float32(block) - np.float32(0.5)
-            return np.asarray(_sample(image, at_px), dtype=np.uint8)
+            return np.asarray(sample_bilinear(image, at_px), dtype=np.uint8)
         scales = [step / block for step in self.step_px]
         offsets = [
             (center + 0.5) / block - 0.5 - middle * scale
             for center, middle, scale in zip(self.center_px, self.middle_px, scales, strict=True)
         ]
         return np.asarray(_sample_affine(image, scales, offsets, (self.width, self.height)), dtype=np.uint8)
-
-    def covered(self) -> NDArray[np.bool_]:
-        """[h, w]: view pixels that show the source image rather than its repeated border."""
-        if self.lens is not None:
-            source = self.lens.source_of_view
-        else:
-            source = (pixel_grid(self.height, self.width) - self.middle_px) * self.step_px + self.center_px
-        low, high = -0.5, np.array([self.source_width, self.source_height]) - 0.5
-        return np.asarray(((source >= low) & (source <= high)).all(axis=-1))
 
     def target_coordinates(self, flow_view_px: Float32Array, stride: int) -> Float32Array:
         """Where each source pixel is predicted to be in the target image, in source-image pixels.
@@ -124,7 +87,7 @@ class InternalView:
         """
         if self.lens is not None:
             cells = (self.lens.view_of_source + np.float32(0.5)) / np.float32(stride) - np.float32(0.5)
-            spread = _sample(self.lens.distorted_flow(self, flow_view_px, stride), cells)
+            spread = sample_bilinear(self.lens.distorted_flow(flow_view_px, stride), cells)
         else:
             scales = [1 / (step * stride) for step in self.step_px]
             offsets = [
@@ -168,13 +131,6 @@ class InternalView:
         mask.setflags(write=False)
         x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
         return mask, (x, y, width, height)
-
-
-def _sample(array: NDArray[Any], at_px: Float32Array) -> NDArray[Any]:
-    """Bilinear samples of [H, W(, C)] at [h, w, 2] pixel coordinates; the border is repeated."""
-    return cv2.remap(  # type: ignore[call-overload, no-any-return]  # the stubs lack the two-channel map
-        array, at_px, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
 
 
 def _sample_affine(
@@ -241,7 +197,7 @@ _CameraKey = tuple[float, float, float, float, DistortionModel, tuple[float, ...
 def _pinhole_view(config: ViewConfig, width: int, height: int, key: _CameraKey) -> InternalView:
     fx, fy, cx, cy, model, coefficients = key
     camera = PinholeCamera(fx, fy, cx, cy, width, height, model, coefficients)
-    lattice_rays = _lattice_rays(camera) if camera.is_distorted else None
+    rays = lattice_rays(camera) if camera.is_distorted else None
     border = np.array([(0, 0), (cx, 0), (width - 1, 0), (width - 1, cy), (width - 1, height - 1), (cx, height - 1)])
     border = np.concatenate([border, [(0, height - 1), (0, cy)]])
     reach_x, reach_y = np.abs(unproject_pixels(camera, border)).max(axis=0) * config.focal_px
@@ -253,8 +209,9 @@ def _pinhole_view(config: ViewConfig, width: int, height: int, key: _CameraKey) 
         (fx / config.focal_px, fy / config.focal_px),
         (cx, cy),
     )
-    if lattice_rays is not None:
-        view = replace(view, lens=_solve_lens_maps(view, camera, lattice_rays))
+    if rays is not None:
+        lens = solve_lens_maps(camera, rays, width=view.width, height=view.height, step_px=view.step_px)
+        view = replace(view, lens=lens)
     if not all(view.region()[2:]):
         raise InvalidInputError(
             f"cx, cy: expected a principal point near enough for the view around it to show a part of the {width}x"
@@ -268,50 +225,3 @@ def _pinhole_view(config: ViewConfig, width: int, height: int, key: _CameraKey) 
 def _padded(side: float) -> int:
     """The next multiple of 32; a hair above one (a principal point off by a pixel) stays on it."""
     return max(1, math.ceil(side / SIDE_MULTIPLE_PX - 0.1)) * SIDE_MULTIPLE_PX
-
-
-def _lattice_rays(camera: PinholeCamera) -> Float64Array:
-    """Undistorted rays [rows, columns, 2] of every 8th source pixel, the last ones up to 7 px beyond the image.
-
-    Pixels of a fisheye that look 90 degrees or more off the axis have no place in a pinhole view: far rays.
-
-    Raises:
-        InvalidInputError: ``camera_invalid``: the distortion folds the image.
-    """
-    rows, columns = (math.ceil((side - 1) / LENS_LATTICE_PX) + 1 for side in (camera.height, camera.width))
-    pixels = pixel_grid(rows, columns) * LENS_LATTICE_PX
-    offset = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    with np.errstate(all="ignore"):  # what diverges is found below
-        rays = unproject_pixels(camera, pixels)
-        lost = ~(np.abs(project_rays(camera, rays) - pixels).max(axis=-1) <= MAX_ROUND_TRIP_PX)
-        in_order = (np.diff(rays[..., 0], axis=1) > 0).all() and (np.diff(rays[..., 1], axis=0) > 0).all()
-    if camera.distortion_model == "equidistant":
-        folds = _fisheye_folds(camera, float(np.hypot(offset[..., 0], offset[..., 1]).max()))
-    else:
-        folds = lost.any() or not in_order
-    if folds:
-        raise InvalidInputError(
-            "distortion_coeffs: expected a distortion that can be undone over the whole image, "
-            f"found {list(camera.distortion_coeffs)} for {camera.distortion_model}, which folds it or is too strong",
-            code="camera_invalid",
-            field="camera.distortion_coeffs",
-        )
-    return np.where(lost[..., None], offset * 1e4, rays)
-
-
-def _fisheye_folds(camera: PinholeCamera, radius: float) -> bool:
-    """Whether two angles below 90 degrees meet within ``radius`` (focal lengths) of the principal point."""
-    angles = np.linspace(0.0, 0.5 * np.pi, 513)[:-1]
-    curve = (project_rays(camera, np.stack([np.tan(angles), 0 * angles], axis=-1))[:, 0] - camera.cx) / camera.fx
-    within = np.logical_and.accumulate(curve[:-1] < radius)
-    return bool((np.diff(curve)[within] <= 0).any())
-
-
-def _solve_lens_maps(view: InternalView, camera: PinholeCamera, lattice_rays: Float64Array) -> _LensMaps:
-    """Lookup tables of a view that has none yet."""
-    offset = pixel_grid(view.height, view.width) - view.middle_px
-    source_of_view = project_rays(camera, offset * np.array(view.step_px) / (camera.fx, camera.fy))
-    coarse = lattice_rays * np.array((camera.fx, camera.fy)) / view.step_px + view.middle_px
-    cells = pixel_grid(view.source_height, view.source_width) / np.float32(LENS_LATTICE_PX)
-    view_of_source = np.asarray(_sample(coarse.astype(np.float32), cells), dtype=np.float32)
-    return _LensMaps(camera, source_of_view.astype(np.float32), view_of_source)
