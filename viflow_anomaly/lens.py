@@ -16,8 +16,8 @@ from viflow_anomaly.geometry import Float32Array, pixel_grid, project_rays, samp
 from viflow_anomaly.sensor_data import Float64Array, PinholeCamera
 
 LENS_LATTICE_PX = 8
-"""Lens maps are solved on a lattice of 8 source pixels and interpolated: the error stays below 0.03 px, in the corners of
-a fisheye's view (60 degrees off its axis) below 0.4 px."""
+"""Lens maps are solved on a lattice of 8 source pixels and interpolated: the error stays below 0.03 px, in the corners
+of a fisheye's view (60 degrees off its axis) below 0.4 px."""
 MAX_ROUND_TRIP_PX = 1.0
 """A lens is understood where undoing and redoing its distortion comes back this close."""
 
