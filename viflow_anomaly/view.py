@@ -9,10 +9,12 @@ coarsest stride); what lies beyond the source image repeats its border.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
-from typing import Any
+from functools import cached_property
+from threading import Lock
+from typing import Any, Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -26,6 +28,11 @@ from viflow_anomaly.sensor_data import DistortionModel, PinholeCamera, Uint8Arra
 
 SIDE_MULTIPLE_PX = 32
 MAX_SIDE_PX = 32767
+MEBIBYTE = 1024 * 1024
+CACHE_ENTRY_BYTES = 4096
+"""What is counted for a cached value beside its arrays, so that their number is bounded, too."""
+
+Cached = TypeVar("Cached")
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +105,14 @@ class InternalView:
             spread = _sample_affine(flow, scales, offsets, (self.source_width, self.source_height))
         return np.asarray(cv2.add(spread, _source_grid(self.source_height, self.source_width)), dtype=np.float32)
 
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of the arrays that the view holds, or will hold once ``analyzed`` was asked."""
+        if self.lens is None:
+            return 0
+        maps = self.lens.source_of_view.nbytes + self.lens.view_of_source.nbytes
+        return maps + self.source_width * self.source_height
+
     def analyzed(self) -> NDArray[np.bool_] | None:
         """[H, W]: source pixels that the view shows, or None when it shows all of them."""
         if self.lens is not None:
@@ -142,11 +157,50 @@ def _sample_affine(
     return cv2.warpAffine(array, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
 
 
-@lru_cache(maxsize=8)
+class ArrayCache(Generic[Cached]):
+    """Values by key; the least recently used ones go while all together take more than ``max_bytes``.
+
+    A value larger than that is made anew each time. Threads may share a cache: values are made outside its lock, and
+    where two threads make the same one, both get the first.
+    """
+
+    def __init__(self, max_bytes: int) -> None:
+        self.max_bytes = max_bytes
+        self.held_bytes = 0
+        self._entries: OrderedDict[Hashable, tuple[Cached, int]] = OrderedDict()
+        self._lock = Lock()
+
+    def get(self, key: Hashable, make: Callable[[], Cached], bytes_of: Callable[[Cached], int]) -> Cached:
+        """The value of ``key``: the one that is held, or what ``make`` gives."""
+        with self._lock:
+            if key in self._entries:
+                self._entries.move_to_end(key)
+                return self._entries[key][0]
+        made = make()
+        size = bytes_of(made) + CACHE_ENTRY_BYTES
+        with self._lock:
+            if key in self._entries:
+                return self._entries[key][0]
+            if size <= self.max_bytes:
+                self._entries[key] = (made, size)
+                self.held_bytes += size
+            while self.held_bytes > self.max_bytes:
+                self.held_bytes -= self._entries.popitem(last=False)[1][1]
+        return made
+
+
+# An image of the largest size that the default limits allow (16 Mi pixels) fits into each.
+_VIEWS: ArrayCache[InternalView] = ArrayCache(256 * MEBIBYTE)
+_SOURCE_GRIDS: ArrayCache[Float32Array] = ArrayCache(160 * MEBIBYTE)
+
+
 def _source_grid(height: int, width: int) -> Float32Array:
-    grid = pixel_grid(height, width)
-    grid.setflags(write=False)
-    return grid
+    def make() -> Float32Array:
+        grid = pixel_grid(height, width)
+        grid.setflags(write=False)
+        return grid
+
+    return _SOURCE_GRIDS.get((height, width), make, lambda grid: grid.nbytes)
 
 
 def make_view(config: ViewConfig, *, width: int, height: int, camera: PinholeCamera | None) -> InternalView:
@@ -167,8 +221,14 @@ def make_view(config: ViewConfig, *, width: int, height: int, camera: PinholeCam
         return _crop_view(config, width, height)
     if camera is None:
         return _shrunk_view(config, width, height)
+    # What the view depends on; the mounting and the clock may differ.
+    # What a view depends on: cameras that differ in their mounting or clock alone share one.
     key = (camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion_model, camera.distortion_coeffs)
-    return _pinhole_view(config, width, height, key)
+    return _VIEWS.get(
+        (config, width, height, key),
+        lambda: _pinhole_view(config, width, height, key),
+        lambda view: view.held_bytes,
+    )
 
 
 def _crop_view(config: ViewConfig, width: int, height: int) -> InternalView:
@@ -193,7 +253,6 @@ def _shrunk_view(config: ViewConfig, width: int, height: int) -> InternalView:
 _CameraKey = tuple[float, float, float, float, DistortionModel, tuple[float, ...]]
 
 
-@lru_cache(maxsize=8)
 def _pinhole_view(config: ViewConfig, width: int, height: int, key: _CameraKey) -> InternalView:
     fx, fy, cx, cy, model, coefficients = key
     camera = PinholeCamera(fx, fy, cx, cy, width, height, model, coefficients)
