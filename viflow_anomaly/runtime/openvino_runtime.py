@@ -5,18 +5,37 @@ from __future__ import annotations
 import hashlib
 import threading
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import openvino
 
 from viflow_anomaly.checkpoint_record import CheckpointRecord, corrupt_checkpoint, read_checkpoint_file
+from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.model_input import ModelInput
 from viflow_anomaly.runtime.exported import FLOW_STRIDE_KEY, WEIGHTS_KEY, exported_metadata
 from viflow_anomaly.runtime.interface import Hypotheses, Scene
 
 MAX_SIZES = 8
 """Compiled networks kept; one takes a few megabytes and some 100 ms to make."""
+
+
+class _Request(NamedTuple):
+    """One inference request, and views of its own buffers by name."""
+
+    request: Any
+    inputs: dict[str, Float32Array]
+    outputs: dict[str, Float32Array]
+
+    @classmethod
+    def of(cls, compiled: Any) -> Self:
+        """A new request; its shapes are fixed, so its buffers stay where they are."""
+        request = compiled.create_infer_request()
+        inputs, outputs = (
+            {port.get_any_name(): request.get_tensor(port).data for port in ports}
+            for ports in (compiled.inputs, compiled.outputs)
+        )
+        return cls(request, inputs, outputs)
 
 
 class OpenvinoRuntime:
@@ -53,33 +72,27 @@ class OpenvinoRuntime:
 
     def predict(self, model_input: ModelInput) -> Hypotheses:
         """All hypotheses of one pair."""
-        window = model_input.window
-        request = self._request(model_input.source.shape)
-        inputs = {
-            "source": model_input.source[None, None].astype(np.float32) * np.float32(1 / 255),
-            "motion": window.values[None],
-            "interval_s": np.array([window.interval_s], dtype=np.float32),
-        }
-        wanted = [port.get_any_name() for port in request.model_inputs]  # an export drops what its network ignores
-        request.infer({name: inputs[name] for name in wanted}, share_inputs=True)
-        flow_px = np.ascontiguousarray(request.get_tensor("flow_px").data[0].transpose(0, 2, 3, 1))
-        names = request.model_outputs
-        if len(names) == 1:
+        height, width = model_input.source.shape
+        request, inputs, outputs = self._request((height, width))
+        np.multiply(model_input.source, np.float32(1 / 255), out=inputs["source"][0, 0])
+        inputs["motion"][0] = model_input.window.values
+        if "interval_s" in inputs:  # an export drops what its network ignores
+            inputs["interval_s"][0] = model_input.window.interval_s
+        request.infer()
+        flow_px = np.ascontiguousarray(outputs["flow_px"][0].transpose(0, 2, 3, 1))
+        if "inverse_depth" not in outputs:
             return Hypotheses(flow_px, self._stride, None)
-        inverse_depth = request.get_tensor("inverse_depth").data[0, 0].copy()
-        rotation = request.get_tensor("rotation").data[0].astype(np.float64)
-        translations_m = request.get_tensor("translation_m").data[0].astype(np.float64)
-        return Hypotheses(flow_px, self._stride, Scene(inverse_depth, rotation, translations_m))
+        rotation, translations_m = (outputs[name][0].astype(np.float64) for name in ("rotation", "translation_m"))
+        return Hypotheses(flow_px, self._stride, Scene(outputs["inverse_depth"][0, 0].copy(), rotation, translations_m))
 
-    def _request(self, size: tuple[int, ...]) -> Any:
-        """An inference request of this thread for views of ``size``: requests hold buffers, so threads share none."""
-        compiled = self._compile((size[0], size[1]))
-        requests: dict[int, Any] = self._requests.__dict__.setdefault("by_network", {})
-        request = requests.get(id(compiled))
+    def _request(self, size: tuple[int, int]) -> _Request:
+        """This thread's request for views of ``size``: requests hold buffers, so threads share none."""
+        requests: dict[tuple[int, int], _Request] = self._requests.__dict__.setdefault("by_size", {})
+        request = requests.get(size)
         if request is None:
             if len(requests) >= MAX_SIZES:
                 requests.clear()
-            request = requests[id(compiled)] = compiled.create_infer_request()
+            request = requests[size] = _Request.of(self._compile(size))
         return request
 
     def _compile(self, size: tuple[int, int]) -> Any:
@@ -94,7 +107,8 @@ class OpenvinoRuntime:
                     {
                         "INFERENCE_PRECISION_HINT": "f32",  # the default is bfloat16 where the CPU has it
                         "INFERENCE_NUM_THREADS": self._threads,
-                        "PERFORMANCE_HINT": "LATENCY",
+                        "NUM_STREAMS": 0,  # in the caller's thread: no hand-over, and callers run side by side
+                        "ENABLE_CPU_PINNING": False,
                     },
                 )
                 if len(self._compiled) >= MAX_SIZES:
