@@ -11,6 +11,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict, SettingsError
 
 from viflow_anomaly.config import DetectorConfig, ImageLimits, RuntimeName, describe_validation
 from viflow_anomaly.errors import ConfigError
+from viflow_anomaly.settings import refuse_unknown_variables
 
 MEBIBYTE = 1024 * 1024
 
@@ -61,8 +62,9 @@ def load_settings(**overrides: Any) -> ServiceSettings:
     """Settings from the environment, with ``overrides`` (those that are not None) on top.
 
     Raises:
-        ConfigError: ``config_invalid`` with the setting at fault.
+        ConfigError: ``config_invalid`` with the setting at fault, or with a variable that nothing takes.
     """
+    refuse_unknown_variables(os.environ)
     given = {name: value for name, value in overrides.items() if value is not None}
     try:
         return ServiceSettings(**given)

@@ -76,22 +76,57 @@ def test_environment_takes_json_values_and_plain_text() -> None:
     assert settings.checkpoint == Path("runs/first")
 
 
-@pytest.mark.parametrize("name", ["VIFLOW_REAL_DATA", "VIFLOW_PORT", "PATH", "OTHER_DETECTOR__REGIONS"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "VIFLOW_REAL_DATA",
+        "VIFLOW_PORT",
+        "VIFLOW_MAX_IMAGE_BYTES",
+        "PATH",
+        "OTHER_DETECTOR__REGIONS",
+        "VIFLOW",
+        "VIFLOW_ANOMALY_SERVICE_HOST",
+        "VIFLOW_ANOMALY_SERVICE_PORT_HTTP",
+        "VIFLOW_ANOMALY_PORT",
+        "VIFLOW_ANOMALY_PORT_8000_TCP_ADDR",
+        "VIFLOW_ANOMALY_CANARY_SERVICE_HOST",
+    ],
+)
 def test_variables_of_others_are_left_alone(name: str) -> None:
     assert resolve_settings(environment={name: "x"}) == Settings()
 
 
-def test_environment_with_an_unknown_section_is_refused() -> None:
-    with pytest.raises(ConfigError, match="VIFLOW_DETECTR__REGIONS__MAX_REGIONS: expected a section among") as caught:
-        resolve_settings(environment={"VIFLOW_DETECTR__REGIONS__MAX_REGIONS": "1"})
+@pytest.mark.parametrize(
+    ("name", "closest"),
+    [
+        ("VIFLOW_THREDS", "VIFLOW_THREADS"),
+        ("VIFLOW_PROT", "VIFLOW_PORT"),
+        ("VIFLOW_MAX_IMAGE_BYTE", "VIFLOW_MAX_IMAGE_BYTES"),
+        ("VIFLOW_DETECTR__REGIONS__MAX_REGIONS", "VIFLOW_DETECTOR__REGIONS__MAX_REGIONS"),
+        ("VIFLOW_DETECTOR_REGIONS_MAX_REGIONS", "VIFLOW_DETECTOR__REGIONS__MAX_REGIONS"),
+        ("VIFLOW_DETECTOR__REGIONS__MAX_REGION", "VIFLOW_DETECTOR__REGIONS__MAX_REGIONS"),
+        ("VIFLOW_PORT__TCP", "VIFLOW_PORT"),
+        ("VIFLOW_", "VIFLOW_PORT"),
+    ],
+)
+def test_an_unknown_variable_is_refused_with_the_closest_known_one(name: str, closest: str) -> None:
+    with pytest.raises(
+        ConfigError, match=f"environment: .* found {name}; the closest known one is {closest}$"
+    ) as caught:
+        resolve_settings(environment={name: "1", "VIFLOW_THREADS": "2"})
     assert caught.value.code == "config_invalid"
-    assert caught.value.field == "detectr"
+    assert caught.value.field == name.removeprefix("VIFLOW_").lower().replace("__", ".")
+
+
+def test_a_section_may_be_one_json_variable() -> None:
+    settings = resolve_settings(environment={"VIFLOW_DETECTOR__REGIONS": '{"max_regions": 5}'})
+    assert settings.detector.regions.max_regions == 5
 
 
 @pytest.mark.parametrize(
     ("layer", "where"),
     [
-        ({"environment": {"VIFLOW_DETECTOR__REGIONS__TYPO": "1"}}, "environment"),
+        ({"environment": {"VIFLOW_DETECTOR__REGIONS": '{"typo": 1}'}}, "environment"),
         ({"environment": {}, "assignments": ["detector.regions.typo=1"]}, "--set"),
         ({"environment": {}, "options": {"detector.regions.typo": 1}}, "command line"),
     ],

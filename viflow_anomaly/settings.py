@@ -3,24 +3,44 @@
 Environment variables start with ``VIFLOW_`` and go down a level at each double underscore
 (``VIFLOW_DETECTOR__REGIONS__THRESHOLD_MADS=8``). The file is TOML or JSON with the same names
 (``[detector.regions]``). Every layer is checked where it enters, so that an error names the layer at fault, and a
-wrong value is refused even where a higher layer would hide it.
+wrong value is refused even where a higher layer would hide it. So is a ``VIFLOW_`` variable that nothing takes.
 """
 
 from __future__ import annotations
 
+import difflib
 import json
+import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, PositiveInt
+from pydantic import BaseModel, Field, PositiveInt
 
 from viflow_anomaly.config import DetectorConfig, FrozenConfig, ImageLimits, ModelConfig, RuntimeName, TrainingConfig
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.simulator.config import SimulatorConfig
 
 ENVIRONMENT_PREFIX = "VIFLOW_"
+SERVICE_SETTINGS = (
+    "host",
+    "port",
+    "max_image_bytes",
+    "max_image_pixels",
+    "max_body_bytes",
+    "max_imu_samples",
+    "max_concurrent",
+    "max_queued",
+    "queue_timeout_s",
+    "body_timeout_s",
+    "shutdown_timeout_s",
+    "log_level",
+)
+"""What the service alone takes and checks. It is built on the library, which cannot ask it; a test compares the two."""
+TEST_SETTINGS = ("real_data",)
+SERVICE_LINK = re.compile(r"VIFLOW_ANOMALY(_\w+)?_(SERVICE_(HOST|PORT)(_\w+)?|PORT(_\d+_\w+)?)")
+"""What Kubernetes puts into the environment of every container beside a service called ``viflow-anomaly``."""
 
 Values = dict[str, Any]
 
@@ -108,27 +128,45 @@ def read_config_file(path: Path) -> Values:
 
 
 def environment_values(environment: Mapping[str, str]) -> Values:
-    """The settings among the environment variables; other ``VIFLOW_`` variables without ``__`` are left alone.
+    """The settings among the environment variables.
 
     Raises:
-        ConfigError: ``config_invalid`` where a variable names a section that does not exist.
+        ConfigError: as ``refuse_unknown_variables``.
     """
+    refuse_unknown_variables(environment)
     entries = []
     for name, text in sorted(environment.items()):
-        if not name.startswith(ENVIRONMENT_PREFIX):
-            continue
         path = name.removeprefix(ENVIRONMENT_PREFIX).lower().split("__")
-        known = path[0] in Settings.model_fields
-        if not known and len(path) > 1:
-            raise ConfigError(
-                f"environment: {name}: expected a section among {', '.join(sorted(Settings.model_fields))}, "
-                f"found {path[0]!r}",
-                code="config_invalid",
-                field=path[0],
-            )
-        if known:
+        if name.startswith(ENVIRONMENT_PREFIX) and path[0] in Settings.model_fields:
             entries.append((path, _value(text)))
     return nested(entries)
+
+
+def refuse_unknown_variables(names: Iterable[str]) -> None:
+    """Nothing, where every ``VIFLOW_`` variable among ``names`` is one of the command line's, service's or tests'.
+
+    Raises:
+        ConfigError: ``config_invalid`` with the closest known name.
+    """
+    known = {ENVIRONMENT_PREFIX + name.upper() for name in (*_variables(Settings), *SERVICE_SETTINGS, *TEST_SETTINGS)}
+    for name in sorted(names):
+        ours = name.startswith(ENVIRONMENT_PREFIX) and not SERVICE_LINK.fullmatch(name)
+        if ours and name.upper() not in known:
+            (closest,) = difflib.get_close_matches(name.upper(), sorted(known), n=1, cutoff=0)
+            raise ConfigError(
+                f"environment: expected a {ENVIRONMENT_PREFIX} variable that viflow-anomaly knows, found {name}; "
+                f"the closest known one is {closest}",
+                code="config_invalid",
+                field=name.removeprefix(ENVIRONMENT_PREFIX).lower().replace("__", "."),
+            )
+
+
+def _variables(section: type[BaseModel], above: str = "") -> Iterator[str]:
+    """Names of all settings of a section and the sections in it: ``detector__regions__max_regions``."""
+    for name, field in section.model_fields.items():
+        yield above + name
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from _variables(field.annotation, f"{above}{name}__")
 
 
 def assignment_values(assignments: Iterable[str]) -> Values:

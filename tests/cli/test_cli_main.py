@@ -81,6 +81,12 @@ def test_config_prints_what_resolves_here(ask: Ask, monkeypatch: pytest.MonkeyPa
     assert settings["simulator"]["rig"] == "drone"
 
 
+@pytest.mark.parametrize("command", ["config", "serve"])
+def test_a_misspelt_variable_is_refused(ask: Ask, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
+    monkeypatch.setenv("VIFLOW_TRAINING__STEP", "7")
+    assert ask([command]).is_refusal("found VIFLOW_TRAINING__STEP; the closest known one is VIFLOW_TRAINING__STEPS")
+
+
 def test_config_refuses_unknown_keys(ask: Ask) -> None:
     assert ask(["config", "--set", "model.layers=3"]).is_refusal("--set: model.layers: Extra inputs are not permitted")
 

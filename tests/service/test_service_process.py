@@ -93,6 +93,13 @@ def test_wrong_settings_end_the_process_with_status_2() -> None:
     assert "Traceback" not in ended.stderr
 
 
+def test_a_misspelt_variable_ends_the_process_with_status_2() -> None:
+    ended = run_module(VIFLOW_PROT="8000")
+    assert ended.returncode == 2
+    assert "found VIFLOW_PROT; the closest known one is VIFLOW_PORT" in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
 def test_a_port_in_use_ends_the_process_with_status_2() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -3,7 +3,8 @@ from __future__ import annotations
 import pytest
 
 from viflow_anomaly.errors import ConfigError
-from viflow_anomaly_service.settings import load_settings
+from viflow_anomaly.settings import SERVICE_SETTINGS, Settings
+from viflow_anomaly_service.settings import ServiceSettings, load_settings
 
 
 def test_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -44,6 +45,24 @@ def test_a_wrong_variable_is_named(monkeypatch: pytest.MonkeyPatch, name: str, v
     with pytest.raises(ConfigError) as caught:
         load_settings()
     assert (caught.value.code, caught.value.field) == ("config_invalid", place)
+
+
+def test_the_library_knows_the_names_that_only_the_service_takes() -> None:
+    assert set(SERVICE_SETTINGS) == set(ServiceSettings.model_fields) - set(Settings.model_fields)
+
+
+def test_an_unknown_variable_is_refused_with_the_closest_known_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VIFLOW_MAX_CONCURENT", "2")
+    with pytest.raises(ConfigError, match=r"found VIFLOW_MAX_CONCURENT; .* is VIFLOW_MAX_CONCURRENT$") as caught:
+        load_settings()
+    assert (caught.value.code, caught.value.field) == ("config_invalid", "max_concurent")
+
+
+@pytest.mark.parametrize("name", ["VIFLOW_TRAINING__STEPS", "VIFLOW_REAL_DATA", "VIFLOW_ANOMALY_SERVICE_HOST"])
+def test_variables_of_others_are_left_alone(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    before = load_settings()
+    monkeypatch.setenv(name, "7")
+    assert load_settings() == before
 
 
 def test_an_unknown_setting_is_refused() -> None:
