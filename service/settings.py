@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -65,6 +66,7 @@ def load_settings(**overrides: Any) -> ServiceSettings:
         ConfigError: ``config_invalid`` with the setting at fault, or with a variable that nothing takes.
     """
     refuse_unknown_variables(os.environ)
+    _refuse_other_limits(os.environ)
     given = {name: value for name, value in overrides.items() if value is not None}
     try:
         return ServiceSettings(**given)
@@ -75,3 +77,15 @@ def load_settings(**overrides: Any) -> ServiceSettings:
         ) from err
     except SettingsError as err:  # a section that is not JSON
         raise ConfigError(f"service settings: {err}", code="config_invalid") from err
+
+
+def _refuse_other_limits(names: Iterable[str]) -> None:
+    """The command line's limits, which a reader of the environment would take for the service's."""
+    for name in sorted(names):
+        if name.upper().startswith("VIFLOW_LIMITS"):
+            raise ConfigError(
+                "environment: expected the limits of the service, VIFLOW_MAX_IMAGE_BYTES and VIFLOW_MAX_IMAGE_PIXELS, "
+                f"found {name}, which limits the other commands only",
+                code="config_invalid",
+                field="limits",
+            )

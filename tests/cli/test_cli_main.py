@@ -215,6 +215,26 @@ def test_serve_hands_its_settings_over(ask: Ask, monkeypatch: pytest.MonkeyPatch
     assert settings.detector.include_masks is True
 
 
+@pytest.mark.parametrize(
+    ("name", "variable"), [("max_bytes", "VIFLOW_MAX_IMAGE_BYTES"), ("max_pixels", "VIFLOW_MAX_IMAGE_PIXELS")]
+)
+def test_serve_refuses_limits_that_would_have_no_effect(
+    ask: Ask, monkeypatch: pytest.MonkeyPatch, name: str, variable: str
+) -> None:
+    stand_in(monkeypatch, "viflow_anomaly_service.server", run=lambda settings: None)
+    answer = ask(["serve", "--set", f"limits.{name}=5000"])
+    assert answer.is_refusal(f"limits.{name}: expected the default")
+    assert f"found 5000; set {variable} [config_invalid]" in answer.err
+
+
+def test_serve_takes_the_printed_configuration(ask: Ask, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    stand_in(monkeypatch, "viflow_anomaly_service.server", run=asked.append)
+    (tmp_path / "settings.json").write_text(ask(["config", "--set", "threads=3"]).out)
+    assert ask(["serve", "--config", str(tmp_path / "settings.json")]).code == 0
+    assert asked[0].threads == 3
+
+
 def test_serve_refuses_bad_settings(ask: Ask, monkeypatch: pytest.MonkeyPatch) -> None:
     assert ask(["serve", "--port", "70000"]).is_refusal("Invalid value for '--port'")
     monkeypatch.setenv("VIFLOW_MAX_CONCURRENT", "0")

@@ -65,6 +65,16 @@ def test_variables_of_others_are_left_alone(monkeypatch: pytest.MonkeyPatch, nam
     assert load_settings() == before
 
 
+@pytest.mark.parametrize("name", ["VIFLOW_LIMITS__MAX_BYTES", "VIFLOW_LIMITS"])
+def test_limits_of_the_command_line_are_refused(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setenv(name, "1000")
+    with pytest.raises(
+        ConfigError, match=f"VIFLOW_MAX_IMAGE_BYTES and VIFLOW_MAX_IMAGE_PIXELS, found {name}"
+    ) as caught:
+        load_settings()
+    assert (caught.value.code, caught.value.field) == ("config_invalid", "limits")
+
+
 def test_an_unknown_setting_is_refused() -> None:
     with pytest.raises(ConfigError, match="colour"):
         load_settings(colour="red")

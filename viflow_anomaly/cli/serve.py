@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from viflow_anomaly.cli.options import Assignments, Checkpoint, ConfigFile, Device, Threads, settings_from
+from viflow_anomaly.errors import ConfigError
+
+if TYPE_CHECKING:
+    from viflow_anomaly.config import ImageLimits
 
 
 def serve(
@@ -28,6 +32,7 @@ def serve(
       viflow-anomaly serve --host 0.0.0.0 --port 8000
     """
     settings = settings_from(config, assignments, {"checkpoint": checkpoint, "threads": threads, "device": device})
+    _refuse_other_limits(settings.limits)
     # By name: the service is built on the library, so no module of the library may import it.
     service_settings = import_module("viflow_anomaly_service.settings")
     server = import_module("viflow_anomaly_service.server")
@@ -41,6 +46,23 @@ def serve(
             detector=settings.detector,
         )
     )
+
+
+def _refuse_other_limits(limits: ImageLimits) -> None:
+    """Limits that were changed would have no effect: the service has its own.
+
+    Raises:
+        ConfigError: ``config_invalid`` with the variable that has one.
+    """
+    for name, field in type(limits).model_fields.items():
+        value = getattr(limits, name)
+        if value != field.default:
+            raise ConfigError(
+                f"limits.{name}: expected the default {field.default} (the service has its own limits), found {value}; "
+                f"set VIFLOW_MAX_IMAGE_{name.removeprefix('max_').upper()}",
+                code="config_invalid",
+                field=f"limits.{name}",
+            )
 
 
 def register(app: typer.Typer) -> None:
