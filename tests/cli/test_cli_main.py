@@ -235,6 +235,13 @@ def test_serve_takes_the_printed_configuration(ask: Ask, tmp_path: Path, monkeyp
     assert asked[0].threads == 3
 
 
+def test_serve_hands_the_runtime_over(ask: Ask, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    stand_in(monkeypatch, "viflow_anomaly_service.server", run=asked.append)
+    assert ask(["serve", "--set", "runtime=torch"]).code == 0
+    assert asked[0].runtime == "torch"
+
+
 def test_serve_refuses_bad_settings(ask: Ask, monkeypatch: pytest.MonkeyPatch) -> None:
     assert ask(["serve", "--port", "70000"]).is_refusal("Invalid value for '--port'")
     monkeypatch.setenv("VIFLOW_MAX_CONCURRENT", "0")

@@ -43,6 +43,7 @@ def serve(
             checkpoint=settings.checkpoint,
             threads=settings.threads,
             device=settings.device,
+            runtime=settings.runtime,
             detector=settings.detector,
         )
     )
