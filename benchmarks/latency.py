@@ -39,7 +39,7 @@ from viflow_anomaly.geometry import Float32Array, pixel_grid, unproject_pixels
 from viflow_anomaly.model_input import prepare
 from viflow_anomaly.prediction import correct
 from viflow_anomaly.regions import find_regions
-from viflow_anomaly.residual import photometric_residual, reconstruct
+from viflow_anomaly.residual import photometric_residual, reconstruct, texture_normalised
 from viflow_anomaly.runtime.loading import load_runtime
 from viflow_anomaly.sensor_data import Frame, FramePair, PinholeCamera, Uint8Array
 
@@ -123,7 +123,9 @@ class Stages:
         residual = photometric_residual(pair.source.image, reconstruction, inside)
         clock.append(time.perf_counter())
         height, width = residual.shape
-        regions = find_regions(residual, inside, self._config.regions).regions
+        config = self._config.regions
+        evidence = texture_normalised(residual, pair.source.image, config.texture_softening_gray)
+        regions = find_regions(evidence, inside, config, residual=residual).regions
         rois_from_regions(regions, ImageSize(width=width, height=height))
         clock.append(time.perf_counter())
         return [(after - before) * 1e3 for before, after in pairwise(clock)]

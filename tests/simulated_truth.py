@@ -8,7 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from worlds import World, make_world, write_euroc
 
-from viflow_anomaly.datasets.simulated_ground_truth import write_depth_png, write_flow_png
+from viflow_anomaly.datasets.simulated_ground_truth import (
+    OBJECT_COLUMNS,
+    read_depth_png,
+    write_depth_png,
+    write_flow_png,
+    write_instances_png,
+)
 
 
 def add_ground_truth(
@@ -29,4 +35,21 @@ def add_ground_truth(
         write_depth_png(truth / "depth" / f"{stamp}.png", np.full((height, width), 10.0, np.float32))
     for stamp in stamps[:-1]:
         write_flow_png(truth / "static_flow" / f"{stamp}.png", flow, known)
+    return folder
+
+
+def add_movers(folder: Path) -> Path:
+    """Two movers in every frame of such a recording: number 1 shifts by 4 px, number 2 by half a pixel."""
+    truth = folder / "mav0" / "groundtruth0"
+    (truth / "instances").mkdir()
+    stamps = sorted(int(path.stem) for path in (truth / "depth").glob("*.png"))
+    height, width = read_depth_png(truth / "depth" / f"{stamps[0]}.png").shape
+    instances = np.zeros((height, width), np.uint8)
+    instances[10:20, 30:44] = 1
+    instances[30:40, 5:15] = 2
+    lines = [",".join(OBJECT_COLUMNS)]
+    for stamp in stamps:
+        write_instances_png(truth / "instances" / f"{stamp}.png", instances)
+        lines += [f"{stamp},1,140,30,10,43,19,4.0", f"{stamp},2,100,5,30,14,39,0.5"]
+    (truth / "objects.csv").write_text("\n".join(lines) + "\n")
     return folder

@@ -220,11 +220,19 @@ class TestThreshold:
 
     def test_it_never_falls_below_the_minimum(self) -> None:
         residual = np.zeros((64, 64), np.float32)
-        residual[10:30, 10:30] = 11.9
+        residual[10:30, 10:30] = 5.9
         result = found(residual)
-        assert result.threshold_gray == 12.0
+        assert result.threshold_gray == 6.0
         assert result.regions == ()
-        assert only(found(residual, LITERAL.model_copy(update={"min_residual_gray": 11.0}))).area_px == 400
+        assert only(found(residual, LITERAL.model_copy(update={"min_residual_gray": 5.0}))).area_px == 400
+
+    def test_evidence_decides_and_the_residual_is_told(self) -> None:
+        evidence, residual = np.zeros((64, 64), np.float32), np.full((64, 64), 3.0, np.float32)
+        evidence[10:30, 10:30], residual[10:30, 10:30] = 40.0, 20.0
+        residual[12, 12] = 50.0
+        region = only(find_regions(evidence, np.ones((64, 64), np.bool_), LITERAL, residual=residual))
+        assert region.residual_max == 50.0
+        assert region.residual_mean == pytest.approx((399 * 20 + 50) / 400)
 
     def test_pixels_outside_have_no_say_and_no_region(self) -> None:
         residual = drawn(TWO_SQUARES)

@@ -8,7 +8,7 @@ from worlds import textured_image
 
 from viflow_anomaly.errors import TooLargeError
 from viflow_anomaly.geometry import pixel_grid
-from viflow_anomaly.residual import photometric_residual, reconstruct
+from viflow_anomaly.residual import photometric_residual, reconstruct, texture_normalised
 
 H, W = 40, 56
 IMAGE = textured_image(W, H)
@@ -75,3 +75,34 @@ def test_sides_beyond_what_opencv_can_address(target_shape: tuple[int, int], sou
     with pytest.raises(TooLargeError, match="32767") as caught:
         reconstruct(np.zeros(target_shape, np.uint8), np.zeros((*source_shape, 2), np.float32))
     assert caught.value.code == "image_too_large"
+
+
+# --- normalised by texture
+
+
+def test_a_flat_picture_doubles_the_residual_and_a_strong_edge_lowers_it() -> None:
+    source = np.full((9, 12), 50, np.uint8)
+    source[:, 6:] = 250
+    residual = np.full((9, 12), 20.0, np.float32)
+    evidence = texture_normalised(residual, source, 10.0)
+    np.testing.assert_allclose(evidence[:, :5], 40.0)
+    np.testing.assert_allclose(evidence[:, 5:7], 20.0 / (200 * 0.5 / 20 + 0.5))
+    np.testing.assert_allclose(evidence[:, 7:], 40.0)
+
+
+def test_at_twice_the_softening_the_residual_stays() -> None:
+    source = np.zeros((8, 8), np.uint8)
+    source[:, ::2] = 20
+    np.testing.assert_allclose(texture_normalised(np.full((8, 8), 7.0, np.float32), source, 10.0), 7.0)
+
+
+def test_without_softening_it_is_the_papers_residual() -> None:
+    residual = np.random.default_rng(0).random((H, W), dtype=np.float32)
+    assert texture_normalised(residual, IMAGE, 0.0) is residual
+
+
+def test_a_misplaced_picture_leaves_less_evidence_than_something_new() -> None:
+    shifted = np.abs(np.roll(IMAGE, 1, axis=1).astype(np.float32) - IMAGE)
+    evidence = texture_normalised(shifted, IMAGE, 10.0)
+    flat = texture_normalised(shifted, np.full_like(IMAGE, 128), 10.0)
+    assert evidence.mean() < 0.7 * flat.mean()

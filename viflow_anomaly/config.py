@@ -117,9 +117,12 @@ class RegionConfig(FrozenConfig):
     Fractions are of the image diagonal unless the name says otherwise; the residual is in gray levels 0-255.
     """
 
+    texture_softening_gray: float = Field(
+        default=10.0, ge=0, le=255, description="residuals count less on edges, see texture_normalised; 0: all alike"
+    )
     smoothing_fraction: float = Field(default=0.003, ge=0, le=0.02)
     threshold_mads: PositiveFloat = 6.0
-    min_residual_gray: float = Field(default=12.0, ge=0, le=255)
+    min_residual_gray: float = Field(default=6.0, ge=0, le=255, description="of the normalised residual")
     opening_fraction: float = Field(default=0.004, ge=0, le=0.1)
     closing_fraction: float = Field(default=0.012, ge=0, le=0.1)
     min_area_fraction: float = Field(default=0.0006, ge=0, le=1, description="of the image's area")

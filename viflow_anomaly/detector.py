@@ -25,7 +25,7 @@ from viflow_anomaly.geometry import Float32Array, pixel_grid
 from viflow_anomaly.model_input import ModelInput, prepare
 from viflow_anomaly.prediction import PredictedFlow, predict_flow
 from viflow_anomaly.regions import find_regions
-from viflow_anomaly.residual import photometric_residual, reconstruct
+from viflow_anomaly.residual import photometric_residual, reconstruct, texture_normalised
 from viflow_anomaly.runtime.interface import Runtime
 from viflow_anomaly.runtime.loading import load_runtime
 from viflow_anomaly.sensor_data import FramePair
@@ -139,7 +139,9 @@ class AnomalyDetector:
         rois: tuple[Roi, ...] = ()
         if not abstained:
             image = ImageSize(width=residual.shape[1], height=residual.shape[0])
-            regions = find_regions(residual, inside, self.config.regions).regions
+            config = self.config.regions
+            evidence = texture_normalised(residual, pair.source.image, config.texture_softening_gray)
+            regions = find_regions(evidence, inside, config, residual=residual).regions
             rois = rois_from_regions(regions, image, include_masks=self.config.include_masks)
         finished = time.perf_counter()
         timings_ms = {

@@ -98,17 +98,20 @@ class _Component(NamedTuple):
     x: IndexArray
 
 
-def find_regions(residual: Float32Array, inside: BoolArray, config: RegionConfig) -> RegionResult:
-    """Connected regions of high residual, each labelled by the paper's shape rule.
+def find_regions(
+    evidence: Float32Array, inside: BoolArray, config: RegionConfig, *, residual: Float32Array | None = None
+) -> RegionResult:
+    """Connected regions of high evidence, each labelled by the paper's shape rule.
 
     Args:
-        residual: [H, W] float32 gray levels, finite.
+        evidence: [H, W] float32 gray levels, finite: the residual or ``texture_normalised``.
+        residual: [H, W] float32 what a region's ``residual_mean`` and ``residual_max`` are of (None: the evidence).
         inside: [H, W], False where the target image does not reach; nothing is found there.
         config: thresholds, see ``RegionConfig``.
     """
-    height, width = residual.shape
+    height, width = evidence.shape
     diagonal_px = float(np.hypot(height, width))
-    smoothed = _smooth(residual, config.smoothing_fraction * diagonal_px)
+    smoothed = _smooth(evidence, config.smoothing_fraction * diagonal_px)
     level = _robust_level(smoothed, inside, config)
     closing_px = _odd_side_px(config.closing_fraction * diagonal_px)
     mask = _clean_mask(smoothed, inside, level, _odd_side_px(config.opening_fraction * diagonal_px), closing_px)
@@ -118,7 +121,10 @@ def find_regions(residual: Float32Array, inside: BoolArray, config: RegionConfig
         min_y_px=config.min_y_extent_fraction * diagonal_px,
         max_aspect_ratio=config.max_aspect_ratio,
     )
-    regions = [_judge(component, residual, level, limits) for component in components]
+    regions = [
+        _judge(component, evidence, evidence if residual is None else residual, level, limits)
+        for component in components
+    ]
     regions.sort(key=lambda region: (-region.score, region.bbox.y, region.bbox.x))
     return RegionResult(tuple(regions), level.threshold_gray, mask)
 
@@ -192,17 +198,19 @@ def _component_labels(y: IndexArray, x: IndexArray, shape: tuple[int, ...], pitc
     return np.asarray(labels[cell_y, cell_x], dtype=np.intp)
 
 
-def _judge(component: _Component, residual: Float32Array, level: _Level, limits: _Limits) -> Region:
+def _judge(
+    component: _Component, evidence: Float32Array, residual: Float32Array, level: _Level, limits: _Limits
+) -> Region:
     y, x = component
     left, top = int(x.min()), int(y[0])
     box = BoundingBox(left, top, int(x.max()) - left + 1, int(y[-1]) - top + 1)
     mask = np.zeros((box.height, box.width), dtype=np.bool_)
     mask[y - top, x - left] = True
     values = residual[y, x]
-    mean_gray = float(values.mean())
+    evidence_gray = float(evidence[y, x].mean())
     fill_ratio = values.size / mask.size
     aspect_ratio = max(box.width, box.height) / min(box.width, box.height)
-    contrast = _contrast(mean_gray, level)
+    contrast = _contrast(evidence_gray, level)
     rule = _shape_rule(box, limits)
     label: RegionLabel = "independent_motion" if rule == "extended_in_x_and_y" else "model_error"
     return Region(
@@ -213,7 +221,7 @@ def _judge(component: _Component, residual: Float32Array, level: _Level, limits:
         y_extent_px=box.height,
         area_px=int(values.size),
         thickness_px=_thickness_px(mask),
-        residual_mean=mean_gray,
+        residual_mean=float(values.mean()),
         residual_max=float(values.max()),
         evidence={
             "rule": rule,

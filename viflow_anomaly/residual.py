@@ -57,3 +57,24 @@ def photometric_residual(source: Uint8Array, reconstruction: Float32Array, insid
     difference = cv2.absdiff(source.astype(np.float32), reconstruction)
     np.copyto(difference, 0.0, where=~inside)
     return np.asarray(difference, dtype=np.float32)
+
+
+def texture_normalised(residual: Float32Array, source: Uint8Array, softening_gray: float) -> Float32Array:
+    """The residual over what a misplacement of one pixel would leave at the same place.
+
+    Half the gray range of the 3x3 pixels around each is that misplacement's residual. Where the source is flat the
+    result is twice the residual, at a range of 2 ``softening_gray`` it is the residual, on strong edges less: errors
+    of the prediction show on edges, things that moved show on plain surfaces, too.
+
+    Args:
+        residual: [H, W] float32 gray levels.
+        source: [H, W] uint8.
+        softening_gray: 0 gives the residual itself (the paper's).
+    """
+    if softening_gray == 0:
+        return residual
+    block = np.ones((3, 3), np.uint8)
+    half_range = cv2.subtract(cv2.dilate(source, block), cv2.erode(source, block)).astype(np.float32)
+    half_range *= np.float32(0.5 / (2 * softening_gray))
+    half_range += np.float32(0.5)
+    return np.asarray(cv2.divide(residual, half_range), dtype=np.float32)

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from pair_world import Ask
-from simulated_truth import add_ground_truth
+from simulated_truth import add_ground_truth, add_movers
 from worlds import make_world, write_euroc
 
 from viflow_anomaly.checkpoint import load_checkpoint, save_checkpoint
@@ -125,11 +125,11 @@ def test_a_result_that_cannot_be_written(ask: Ask, recordings: list[Path], check
     assert answer.is_refusal(f"{tmp_path.name}.")
 
 
-@pytest.mark.parametrize("arguments", [["evaluate", "--help"], ["evaluate", "flow", "--help"]])
+@pytest.mark.parametrize("arguments", [["evaluate"], ["evaluate", "flow"], ["evaluate", "detect"]])
 def test_help_shows_examples(ask: Ask, arguments: list[str]) -> None:
-    answer = ask(arguments)
+    answer = ask([*arguments, "--help"])
     assert answer.code == 0
-    assert answer.out.count("viflow-anomaly evaluate flow") >= 2
+    assert answer.out.count("viflow-anomaly evaluate ") >= 2
 
 
 def test_help_loads_nothing_heavy() -> None:
@@ -155,3 +155,27 @@ def test_the_processor_has_a_name_everywhere(monkeypatch: pytest.MonkeyPatch, co
         patch.setattr("platform.processor", lambda: "")
         patch.setattr("platform.machine", lambda: "riscv64")
         assert evaluate_module._cpu_model() == "riscv64"
+
+
+# --- evaluate detect
+
+
+def test_detection_json_and_table(ask: Ask, checkpoint: Path, tmp_path: Path) -> None:
+    frames = {"drone_000001": 3, "drone_000002": 2, "car_000001": 2}
+    folders = [add_movers(add_ground_truth(tmp_path / name, make_world(frames=n))) for name, n in frames.items()]
+    command = ["evaluate", "detect", *map(str, folders), "--checkpoint", str(checkpoint)]
+    answer = ask([*command, "--no-rivals", "--json", "--out", str(tmp_path / "detect.json")])
+    assert (answer.code, answer.err) == (0, "")
+    report: dict[str, Any] = json.loads(answer.out)
+    assert json.loads((tmp_path / "detect.json").read_text()) == report
+    assert {name: one["viflow-anomaly"]["frames"] for name, one in report["groups"].items()} == {"car": 1, "drone": 3}
+    assert report["detector"]["correction"]["enabled"] is True
+    table = ask(command).out
+    assert "homography difference" in table
+    assert "ROI AP" in table
+
+
+def test_detection_refuses_what_it_cannot_judge(ask: Ask, checkpoint: Path, tmp_path: Path) -> None:
+    plain = write_euroc(tmp_path / "V1_01")
+    command = ["evaluate", "detect", str(plain), "--checkpoint", str(checkpoint)]
+    assert ask(command).is_refusal("[ground_truth_missing]")
