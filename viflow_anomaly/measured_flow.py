@@ -41,17 +41,18 @@ class MeasuredFlow(NamedTuple):
     stride: int
 
 
-def measure_flow(source: Uint8Array, target: Uint8Array, *, stride: int) -> MeasuredFlow:
+def measure_flow(source: Uint8Array, target: Uint8Array, *, stride: int, thorough: bool = False) -> MeasuredFlow:
     """Measure the flow between two views [H, W]; sides are multiples of ``stride``, and even.
 
-    Source: Kroeger et al., Fast Optical Flow using Dense Inverse Search (ECCV 2016); OpenCV's preset "ultrafast", one
-    level finer, because views are small.
+    Source: Kroeger et al., Fast Optical Flow using Dense Inverse Search (ECCV 2016); OpenCV's preset "ultrafast" (or
+    "medium", ``thorough``, at three times the time), one level finer, because views are small.
     """
     height, width = source.shape
     cells = (width // stride, height // stride)
     if min(height, width) < MIN_SIDE_PX:
         return MeasuredFlow(np.zeros((*cells[::-1], 2), np.float32), np.zeros(cells[::-1], np.float32), stride)
-    search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)  # type: ignore[attr-defined]
+    fast, slow = cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST, cv2.DISOPTICAL_FLOW_PRESET_MEDIUM
+    search = cv2.DISOpticalFlow_create(slow if thorough else fast)  # type: ignore[attr-defined]
     search.setFinestScale(FINEST_SCALE)
     flow = search.calc(source, target, None)
     flow_px = np.asarray(cv2.resize(flow, cells, interpolation=cv2.INTER_AREA), dtype=np.float32)

@@ -18,7 +18,7 @@ from viflow_anomaly.losses import LossResult, photometric_error, photometric_los
 from viflow_anomaly.model.layers import rigid_flow
 from viflow_anomaly.model.outputs import RigidScene, ViflowOutput
 
-MEASURED_WEIGHT = 0.3
+MEASURED_WEIGHT = 1.0
 TRANSLATION_WEIGHT = 0.2
 SMOOTHNESS_WEIGHT = 0.02
 MEASURED_TOLERANCE_PX = 0.5
@@ -38,7 +38,10 @@ def corrected_loss(
     """
     scene = output.scene
     assert scene is not None
-    competition = photometric_loss(output, batch.source, batch.target, relaxation=relaxation)
+    # Depth learns under the corrected motion only: judged by hypotheses it would make up for their wrong translations.
+    flow_px = rigid_flow(rays, scene.inverse_depth.detach(), scene.rotation, scene.translation_m) * focal_px
+    hypotheses = ViflowOutput(flow_px, output.stride)
+    competition = photometric_loss(hypotheses, batch.source, batch.target, relaxation=relaxation)
     rotation, translation, trusted = _corrected(scene, competition.winners, batch, rays, focal_px)
     flow_px = rigid_flow(rays, scene.inverse_depth, rotation, translation.unsqueeze(1))[:, 0] * focal_px
     photometric = photometric_error(flow_px, batch.source, batch.target, stride=output.stride)

@@ -172,7 +172,7 @@ def _add_recording(
         bucket.mirrorable.append(in_camera_axes)
         if measure:
             views = (bucket.frames[place] for place in bucket.pairs[-1])
-            measured = measure_flow(*views, stride=FLOW_STRIDE)
+            measured = measure_flow(*views, stride=FLOW_STRIDE, thorough=True)
             bucket.measured_px.append(measured.flow_px.astype(np.float16))
             bucket.confidence.append((measured.confidence * 255).astype(np.uint8))
 

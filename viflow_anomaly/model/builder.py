@@ -11,6 +11,14 @@ from viflow_anomaly.model.calibrated import CalibratedViflow
 from viflow_anomaly.model.compact import CompactViflow
 from viflow_anomaly.model.paper import PaperViflow
 
+CONVOLUTIONAL_PRESETS: dict[
+    str, tuple[type[CompactViflow] | type[CalibratedViflow], tuple[int, int, int, int], int, int]
+] = {
+    "compact": (CompactViflow, (24, 48, 112, 128), 256, 128),
+    "calibrated": (CalibratedViflow, (16, 32, 72, 96), 128, 64),
+}
+"""Network, channels at strides 4, 8, 16, 32, and widths of the motion encoder's hidden layers and code."""
+
 
 def build_model(config: ModelConfig, *, seed: int = 0) -> nn.Module:
     """A freshly initialised network; the same seed gives the same weights and leaves the global generator alone.
@@ -22,8 +30,11 @@ def build_model(config: ModelConfig, *, seed: int = 0) -> nn.Module:
         torch.manual_seed(seed)
         if config.preset == "paper":
             return _build_paper(config)
-        network = {"compact": CompactViflow, "calibrated": CalibratedViflow}[config.preset]
+        network, widths, motion_width, code_width = CONVOLUTIONAL_PRESETS[config.preset]
         return network(
+            widths=widths,
+            motion_width=motion_width,
+            code_width=code_width,
             motion_rows=config.motion_window.rows,
             interval_rows=config.motion_window.samples_between,
             hypotheses=config.hypotheses,

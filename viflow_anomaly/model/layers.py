@@ -81,9 +81,9 @@ class ConvolutionalViflow(nn.Module):
         interval_rows: int,
         hypotheses: int,
         focal_px: float,
-        widths: tuple[int, int, int, int] = (24, 48, 112, 128),
-        motion_width: int = 256,
-        code_width: int = 128,
+        widths: tuple[int, int, int, int],
+        motion_width: int,
+        code_width: int,
     ) -> None:
         super().__init__()
         w4, w8, w16, w32 = widths
