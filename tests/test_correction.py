@@ -68,7 +68,7 @@ def test_a_motion_within_the_priors_reach_is_found() -> None:
     corrected = correct_motion(RAYS, seen.inverse_depth, near, seen.measured, FOCAL_PX, CorrectionConfig(rounds=10))
     assert corrected.converged
     assert corrected.motion is not None
-    np.testing.assert_allclose(corrected.motion.translation_m, TRANSLATION_M, atol=2e-3)
+    np.testing.assert_allclose(corrected.motion.translation, TRANSLATION_M, atol=2e-3)
     assert np.linalg.norm(so3_log(corrected.motion.rotation @ seen.true.rotation.T)) < 2e-4
     assert error_px(corrected.flow_px, seen) < 0.05
     assert corrected.inlier_share > 0.95

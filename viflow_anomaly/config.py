@@ -143,7 +143,7 @@ class CorrectionConfig(FrozenConfig):
     rounds: int = Field(default=4, ge=1, le=50)
     tolerance_px: PositiveFloat = Field(default=0.7, description="view pixels at which a cell's weight is halved")
     rotation_sigma_rad: PositiveFloat = Field(default=0.004, description="how far the gyro's rotation may be off")
-    translation_sigma: PositiveFloat = Field(default=1.0, description="metres; damps directions nothing speaks for")
+    translation_sigma: PositiveFloat = Field(default=1.0, description="mean depths; damps what nothing speaks for")
     lattice_px: PositiveInt = Field(default=8, description="view pixels between the flow cells that take part")
     min_confidence: float = Field(
         default=0.002, ge=0, le=1, description="mean of the cells' confidence below which nothing is corrected"

@@ -28,10 +28,10 @@ BLEND_SIGMA = 0.5
 
 
 class RigidMotion(NamedTuple):
-    """X_target = rotation X_source + translation: [3, 3] and [3] in the length unit of the inverse depth."""
+    """X_target = rotation X_source + translation: [3, 3] and [3] in the unit whose inverse the depth is in."""
 
     rotation: Float64Array
-    translation_m: Float64Array
+    translation: Float64Array
 
 
 class Correction(NamedTuple):
@@ -69,7 +69,7 @@ def _moved(
     x: Float32Array, y: Float32Array, inverse_depth: Float32Array, motion: RigidMotion
 ) -> tuple[Float32Array, Float32Array, Float32Array]:
     """(x, y) of every ray after the motion, and its inverse depth there."""
-    rotation, translation = motion.rotation.astype(np.float32), motion.translation_m.astype(np.float32)
+    rotation, translation = motion.rotation.astype(np.float32), motion.translation.astype(np.float32)
     px, py, pz = (
         row[0] * x + row[1] * y + row[2] + inverse_depth * t for row, t in zip(rotation, translation, strict=True)
     )
@@ -110,7 +110,7 @@ def correct_motion(
         _fill_jacobian(jacobian, moved_x, moved_y, nearness)
         step = _weighted_step(jacobian, error, weights, prior, _pull(prior, turned))
         turned = turned + step[:3]
-        motion = RigidMotion(so3_exp(step[:3]) @ motion.rotation, motion.translation_m + step[3:])
+        motion = RigidMotion(so3_exp(step[:3]) @ motion.rotation, motion.translation + step[3:])
     before = rigid_flow_px(rays, inverse_depth, start, focal_px)
     after = rigid_flow_px(rays, inverse_depth, motion, focal_px)
     return _accepted(before, after, measured, config, start, motion)

@@ -39,7 +39,7 @@ def corrected_loss(
     scene = output.scene
     assert scene is not None
     # Depth learns under the corrected motion only: judged by hypotheses it would make up for their wrong translations.
-    flow_px = rigid_flow(rays, scene.inverse_depth.detach(), scene.rotation, scene.translation_m) * focal_px
+    flow_px = rigid_flow(rays, scene.inverse_depth.detach(), scene.rotation, scene.translation) * focal_px
     hypotheses = ViflowOutput(flow_px, output.stride)
     competition = photometric_loss(hypotheses, batch.source, batch.target, relaxation=relaxation)
     rotation, translation, trusted = _corrected(scene, competition.winners, batch, rays, focal_px)
@@ -47,8 +47,8 @@ def corrected_loss(
     photometric = photometric_error(flow_px, batch.source, batch.target, stride=output.stride)
     loss = competition.loss + (trusted * photometric).mean()
     loss = loss + MEASURED_WEIGHT * (trusted * _measured_error(flow_px, batch)).mean()
-    chosen = scene.translation_m[torch.arange(len(translation)), competition.winners]
-    missed = (chosen - translation).norm(dim=-1) / (translation.norm(dim=-1) + 0.05)
+    chosen = scene.translation[torch.arange(len(translation)), competition.winners]
+    missed = (chosen - translation).norm(dim=-1) / (translation.norm(dim=-1) + 0.005)
     loss = loss + TRANSLATION_WEIGHT * (trusted * missed.clamp_max(3.0)).mean()
     loss = loss + SMOOTHNESS_WEIGHT * _roughness(scene.inverse_depth, batch.source, output.stride)
     return LossResult(loss, competition.winners)
@@ -62,7 +62,7 @@ def _corrected(
     rays_of_cells = np.ascontiguousarray(rays[0].permute(1, 2, 0).cpu().numpy())
     depth = scene.inverse_depth.detach().float().cpu().numpy()[:, 0]
     rotations = scene.rotation.detach().double().cpu().numpy()
-    chosen = scene.translation_m.detach()[torch.arange(len(winners)), winners].double().cpu().numpy()
+    chosen = scene.translation.detach()[torch.arange(len(winners)), winners].double().cpu().numpy()
     motions, trusted = [], []
     for index, measured in enumerate(batch.measured):
         start = RigidMotion(rotations[index], chosen[index])
@@ -72,7 +72,7 @@ def _corrected(
     like = scene.inverse_depth
     return (
         like.new_tensor(np.stack([motion.rotation for motion in motions])),
-        like.new_tensor(np.stack([motion.translation_m for motion in motions])),
+        like.new_tensor(np.stack([motion.translation for motion in motions])),
         like.new_tensor(trusted),
     )
 

@@ -4,7 +4,8 @@ The view's focal length and the IMU's axes are fixed by the calibration, so the 
 same flow on every rig: weights trained on many simulated rigs run on a new one from its calibration file (the paper's
 first limit [Limitations]). Global shifter: the gyro's rotation moves every ray exactly, and the motion code gives one
 translation for each hypothesis, because speed does not show in a short IMU window. Local shifter: one inverse depth a
-cell, from the source image alone.
+cell, from the source image alone. Flow depends on depth and translation only through their ratio, so the unit of length
+is the view's own: the depth whose inverse is the mean inverse depth. Left free, the scale drifted by a thousand.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from torch import nn
 from viflow_anomaly.model.layers import FLOW_STRIDE, ConvolutionalViflow, rigid_flow
 from viflow_anomaly.model.outputs import RigidScene, ViflowOutput
 
-FIRST_INVERSE_DEPTH = 0.2
-"""1/m, of an untrained network: 5 m."""
-FIRST_SPEED_M_S = 0.7
-"""Deviation of the untrained hypotheses' velocities along each axis."""
+FIRST_SPEED_PER_S = 0.3
+"""Deviation of the untrained hypotheses' velocities along each axis, in mean depths a second."""
+MIN_INVERSE_DEPTH = 1e-3
+"""Of the mean, before normalisation: nothing is infinitely far, so the mean is never zero."""
 
 
 class CalibratedViflow(ConvolutionalViflow):
@@ -32,7 +33,7 @@ class CalibratedViflow(ConvolutionalViflow):
         code_width, features = self.modulate4.linear.in_features, self.modulate4.linear.out_features // 2
         self.velocity_head = nn.Linear(code_width, self.hypotheses * 3)
         nn.init.normal_(self.velocity_head.weight, std=0.02)
-        nn.init.normal_(self.velocity_head.bias, std=FIRST_SPEED_M_S)
+        nn.init.normal_(self.velocity_head.bias, std=FIRST_SPEED_PER_S)
         self.depth_head = nn.Conv2d(features, 1, 1)
         nn.init.normal_(self.depth_head.weight, std=1e-2)
         assert self.depth_head.bias is not None
@@ -44,12 +45,12 @@ class CalibratedViflow(ConvolutionalViflow):
         rows, columns = -(-height // FLOW_STRIDE), -(-width // FLOW_STRIDE)
         code = self.motion_encoder(motion, interval_s)
         rays = self.rays(source)
-        velocity_m_s = self.velocity_head(code).unflatten(-1, (self.hypotheses, 3))
-        translation_m = velocity_m_s * interval_s[:, None, None]
+        velocity = self.velocity_head(code).unflatten(-1, (self.hypotheses, 3))
+        translation = velocity * interval_s[:, None, None]
         rotation = self.rotation(motion, interval_s)
-        # Softplus, scaled so that an untrained head starts at FIRST_INVERSE_DEPTH.
-        raw = self.depth_head(self.features(source, code, rays))
-        inverse_depth = F.softplus(raw * 3.0) * (FIRST_INVERSE_DEPTH / 0.6931472)
-        flow = rigid_flow(rays, inverse_depth, rotation, translation_m) * self.focal_px
-        scene = RigidScene(inverse_depth[..., :rows, :columns], rotation, translation_m)
+        raw = self.depth_head(self.features(source, code, rays)).float()
+        positive = F.softplus(raw * 3.0) + MIN_INVERSE_DEPTH
+        inverse_depth = positive / positive[..., :rows, :columns].mean(dim=(2, 3), keepdim=True)
+        flow = rigid_flow(rays, inverse_depth, rotation, translation) * self.focal_px
+        scene = RigidScene(inverse_depth[..., :rows, :columns], rotation, translation)
         return ViflowOutput(flow[..., :rows, :columns], FLOW_STRIDE, scene)

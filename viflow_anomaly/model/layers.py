@@ -156,7 +156,7 @@ def rotation_matrix(theta: torch.Tensor) -> torch.Tensor:
 
 
 def rigid_flow(
-    rays: torch.Tensor, inverse_depth: torch.Tensor, rotation: torch.Tensor, translation_m: torch.Tensor
+    rays: torch.Tensor, inverse_depth: torch.Tensor, rotation: torch.Tensor, translation: torch.Tensor
 ) -> torch.Tensor:
     """Flow of a static world under a rigid camera motion: X_target = R X_source + t.
 
@@ -164,7 +164,7 @@ def rigid_flow(
         rays: [1, 2, h, w] (x, y) in focal lengths.
         inverse_depth: [B, 1, h, w] in 1/m; zeros: rotation only.
         rotation: [B, 3, 3].
-        translation_m: [B, K, 3].
+        translation: [B, K, 3].
 
     Returns:
         [B, K, 2, h, w] in focal lengths.
@@ -172,7 +172,7 @@ def rigid_flow(
     # Element by element and in float32: under autocast a product of matrices would round angles to eight bits.
     columns = rotation.float()[..., None, None].unbind(dim=2)  # 3 of B, 3, 1, 1
     moved = columns[0] * rays[:, :1] + columns[1] * rays[:, 1:] + columns[2]
-    moved = moved.unsqueeze(1) + inverse_depth.float().unsqueeze(1) * translation_m.float()[..., None, None]
+    moved = moved.unsqueeze(1) + inverse_depth.float().unsqueeze(1) * translation.float()[..., None, None]
     return moved[:, :, :2] / moved[:, :, 2:].clamp_min(0.1) - rays.unsqueeze(1)
 
 

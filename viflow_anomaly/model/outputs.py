@@ -11,14 +11,15 @@ class RigidScene(NamedTuple):
     """The static world and the camera's motion, from which flow follows.
 
     Attributes:
-        inverse_depth: [B, 1, h, w] along the optical axis, in 1/m (up to the scale that motion leaves open).
+        inverse_depth: [B, 1, h, w] along the optical axis, over its mean in the view (which is 1).
         rotation: [B, 3, 3], maps source-camera to target-camera coordinates.
-        translation_m: [B, K, 3], X_target = rotation X_source + translation, one for each hypothesis.
+        translation: [B, K, 3], X_target = rotation X_source + translation, one for each hypothesis; the unit of length
+            is the inverse of the mean inverse depth.
     """
 
     inverse_depth: torch.Tensor
     rotation: torch.Tensor
-    translation_m: torch.Tensor
+    translation: torch.Tensor
 
 
 class ViflowOutput(NamedTuple):

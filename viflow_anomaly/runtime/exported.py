@@ -11,7 +11,7 @@ MODEL_KEY = "viflow.model"
 FLOW_STRIDE_KEY = "viflow.flow_stride"
 INPUT_NAMES = ("source", "motion", "interval_s")
 FLOW_OUTPUTS = ("flow_px",)
-SCENE_OUTPUTS = ("flow_px", "inverse_depth", "rotation", "translation_m")
+SCENE_OUTPUTS = ("flow_px", "inverse_depth", "rotation", "translation")
 
 
 def exported_metadata(model: Any) -> dict[str, str]:

@@ -14,18 +14,18 @@ class Scene(NamedTuple):
     """What a calibrated network says of the static world and the camera.
 
     Attributes:
-        inverse_depth: [h, w] float32, 1/m.
+        inverse_depth: [h, w] float32, mean 1: its unit and the translations' go together.
         rotation: [3, 3], maps source-camera to target-camera coordinates.
-        translations_m: [K, 3], one for each hypothesis.
+        translations: [K, 3], one for each hypothesis.
     """
 
     inverse_depth: Float32Array
     rotation: Float64Array
-    translations_m: Float64Array
+    translations: Float64Array
 
     def motion(self, hypothesis: int) -> RigidMotion:
         """The camera motion of one hypothesis."""
-        return RigidMotion(self.rotation, self.translations_m[hypothesis])
+        return RigidMotion(self.rotation, self.translations[hypothesis])
 
 
 class Hypotheses(NamedTuple):

@@ -82,8 +82,8 @@ class OpenvinoRuntime:
         flow_px = np.ascontiguousarray(outputs["flow_px"][0].transpose(0, 2, 3, 1))
         if "inverse_depth" not in outputs:
             return Hypotheses(flow_px, self._stride, None)
-        rotation, translations_m = (outputs[name][0].astype(np.float64) for name in ("rotation", "translation_m"))
-        return Hypotheses(flow_px, self._stride, Scene(outputs["inverse_depth"][0, 0].copy(), rotation, translations_m))
+        rotation, translations = (outputs[name][0].astype(np.float64) for name in ("rotation", "translation"))
+        return Hypotheses(flow_px, self._stride, Scene(outputs["inverse_depth"][0, 0].copy(), rotation, translations))
 
     def _request(self, size: tuple[int, int]) -> _Request:
         """This thread's request for views of ``size``: requests hold buffers, so threads share none."""

@@ -34,7 +34,7 @@ class TorchRuntime:
             output = self._network(source, batch.motion, batch.interval_s)
         scene = None
         if output.scene is not None:
-            inverse_depth, rotation, translation_m = (one[0].float().cpu().numpy() for one in output.scene)
-            scene = Scene(inverse_depth[0], rotation.astype(np.float64), translation_m.astype(np.float64))
+            inverse_depth, rotation, translation = (one[0].float().cpu().numpy() for one in output.scene)
+            scene = Scene(inverse_depth[0], rotation.astype(np.float64), translation.astype(np.float64))
         flow_px = output.flow_px[0].permute(0, 2, 3, 1).float().cpu().contiguous().numpy()
         return Hypotheses(flow_px, output.stride, scene)
