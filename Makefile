@@ -23,11 +23,11 @@ COVERAGE_FLOOR ?= 90
 MODEL_DIR ?= runs/model
 MODEL_SEQUENCES ?= 360
 MODEL_FRAMES ?= 32
-MODEL_STEPS ?= 20000
+MODEL_STEPS ?= 15000
 MODEL_JOBS ?= 2
 MODEL_THREADS ?= 1
 MODEL_TRAINING := --set model.preset=calibrated --set training.learning_rate=0.0015 --set training.warmup_steps=200 \
-  --set training.validate_every=4000
+  --set training.validate_every=5000
 HELD_OUT_SEQUENCES ?= 12
 HELD_OUT_FRAMES ?= 20
 

@@ -114,7 +114,7 @@ def test_tensors_of_another_architecture(saved: Path) -> None:
     error = refusal(saved)
     assert error.code == "checkpoint_corrupt"
     assert str(saved) in error.message
-    assert "size mismatch for global_head.weight" in error.message
+    assert "size mismatch for velocity_head.weight" in error.message
     assert "\n" not in error.message
 
 
