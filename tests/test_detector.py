@@ -182,6 +182,14 @@ def test_images_that_share_nothing_cannot_be_judged(detector: AnomalyDetector) -
     assert "no_overlap" in [reason.code for reason in detection.reasons]
 
 
+def test_a_small_overlap_is_judged_only_where_it_is_allowed(detector: AnomalyDetector) -> None:
+    """Half a radian of turn leaves about a quarter of the picture."""
+    far = pair(texture(8), turned(texture(8), (0.0, 10.0, 0.0)), rate=(0.0, 10.0, 0.0))
+    assert detector.detect(far).status == "ok"
+    strict = detector.with_config(DetectorConfig(min_overlap=0.5)).detect(far)
+    assert (strict.status, [reason.code for reason in strict.reasons]) == ("abstained", ["no_overlap"])
+
+
 @pytest.mark.parametrize(("height", "width"), [(65, 65), (225, 224), (33, 500), (376, 1241)])
 def test_any_size_of_image_is_answered_in_its_own_pixels(detector: AnomalyDetector, height: int, width: int) -> None:
     image = texture(10, height, width)

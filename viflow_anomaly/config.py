@@ -157,6 +157,7 @@ class DetectorConfig(FrozenConfig):
     correction: CorrectionConfig = CorrectionConfig()
     include_masks: bool = False
     min_texture_gray: float = Field(default=2.0, ge=0, description="standard deviation below which nothing is judged")
+    min_overlap: float = Field(default=0.05, ge=0, le=1, description="share of the analysed pixels still in the target")
     max_exposure_jump_gray: float = Field(default=40.0, ge=0, description="change of the mean between the frames")
 
 

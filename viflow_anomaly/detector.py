@@ -34,7 +34,7 @@ RESIDUAL_SAMPLE_STRIDE = 3
 """The residual's summary is taken on every third row and column."""
 NOTHING_IN_COMMON = Reason(
     code="no_overlap",
-    message="expected the two images to share a part of the scene, found a predicted motion beyond the whole image",
+    message="expected the two images to share a part of the scene, found a predicted motion that leaves next to nothing",
 )
 
 
@@ -132,7 +132,8 @@ class AnomalyDetector:
             inside &= analyzed
         residual = photometric_residual(pair.source.image, reconstruction, inside)
         inferred = time.perf_counter()
-        summary = _summary(residual, inside)
+        x, y, region_width, region_height = model_input.view.region()
+        summary = _summary(residual, inside, self.config.min_overlap, region_width * region_height)
         reasons, abstained = self._judge_input(pair, model_input)
         if summary is None:
             reasons, abstained = (*reasons, NOTHING_IN_COMMON), True
@@ -151,7 +152,6 @@ class AnomalyDetector:
             "total": decode_ms + (finished - started) * 1e3,
         }
         height, width = residual.shape
-        x, y, region_width, region_height = model_input.view.region()
         detection = Detection(
             source_timestamp_ns=pair.source.timestamp_ns,
             target_timestamp_ns=pair.target.timestamp_ns,
@@ -196,10 +196,14 @@ class AnomalyDetector:
         return tuple(reasons), abstained
 
 
-def _summary(residual: Float32Array, inside: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> ResidualSummary | None:
+def _summary(
+    residual: Float32Array, inside: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], min_share: float, analyzed_px: int
+) -> ResidualSummary | None:
+    """None where less than ``min_share`` of the analysed pixels are still in the target image."""
+    min_values = min_share * analyzed_px / RESIDUAL_SAMPLE_STRIDE**2
     thin = (slice(None, None, RESIDUAL_SAMPLE_STRIDE),) * 2
     values = residual[thin][inside[thin]]
-    if not values.size:
+    if values.size == 0 or values.size < min_values:
         return None
     mean = float(values.mean())
     ranks = [int(share * (values.size - 1)) for share in (0.5, 0.95)]
