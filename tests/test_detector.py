@@ -183,11 +183,12 @@ def test_images_that_share_nothing_cannot_be_judged(detector: AnomalyDetector) -
 
 
 def test_a_small_overlap_is_judged_only_where_it_is_allowed(detector: AnomalyDetector) -> None:
-    """Half a radian of turn leaves about a quarter of the picture."""
-    far = pair(texture(8), turned(texture(8), (0.0, 10.0, 0.0)), rate=(0.0, 10.0, 0.0))
+    """0.7 radians of turn leave about a third of the picture."""
+    far = pair(texture(8), turned(texture(8), (0.0, 14.0, 0.0)), rate=(0.0, 14.0, 0.0))
     assert detector.detect(far).status == "ok"
     strict = detector.with_config(DetectorConfig(min_overlap=0.5)).detect(far)
-    assert (strict.status, [reason.code for reason in strict.reasons]) == ("abstained", ["no_overlap"])
+    assert strict.status == "abstained"
+    assert "no_overlap" in [reason.code for reason in strict.reasons]
 
 
 @pytest.mark.parametrize(("height", "width"), [(65, 65), (225, 224), (33, 500), (376, 1241)])

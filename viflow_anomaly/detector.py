@@ -34,7 +34,7 @@ RESIDUAL_SAMPLE_STRIDE = 3
 """The residual's summary is taken on every third row and column."""
 NOTHING_IN_COMMON = Reason(
     code="no_overlap",
-    message="expected the two images to share a part of the scene, found a predicted motion that leaves next to nothing",
+    message="expected the two images to share a part of the scene, found a predicted motion that leaves hardly any",
 )
 
 
