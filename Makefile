@@ -94,6 +94,7 @@ held-out: $(VENV)/.installed-dev
 
 evaluate: held-out
 	$(BIN)/viflow-anomaly evaluate flow $(MODEL_DIR)/held-out/* --out benchmarks/results/endpoint-error.json
+	$(BIN)/viflow-anomaly evaluate detect $(MODEL_DIR)/held-out/* --out benchmarks/results/detection.json
 
 clean:
 	rm -rf build dist $(DEMO_OUT) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis .coverage

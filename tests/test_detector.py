@@ -191,6 +191,14 @@ def test_a_small_overlap_is_judged_only_where_it_is_allowed(detector: AnomalyDet
     assert "no_overlap" in [reason.code for reason in strict.reasons]
 
 
+def test_images_that_confirm_no_motion_lower_trust(detector: AnomalyDetector) -> None:
+    for target in (texture(21), np.clip(np.full((HEIGHT, WIDTH), 128.0) + texture(22) / 10, 0, 255).astype(np.uint8)):
+        detection = detector.detect(pair(texture(20), target))
+        assert "motion_unconfirmed" in [reason.code for reason in detection.reasons]
+    feed_forward = detector.with_config(DetectorConfig(correction=CorrectionConfig(enabled=False)))
+    assert feed_forward.detect(pair(texture(20), texture(21))).reasons == ()
+
+
 @pytest.mark.parametrize(("height", "width"), [(65, 65), (225, 224), (33, 500), (376, 1241)])
 def test_any_size_of_image_is_answered_in_its_own_pixels(detector: AnomalyDetector, height: int, width: int) -> None:
     image = texture(10, height, width)

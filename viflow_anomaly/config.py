@@ -145,6 +145,7 @@ class CorrectionConfig(FrozenConfig):
     rotation_sigma_rad: PositiveFloat = Field(default=0.004, description="how far the gyro's rotation may be off")
     translation_sigma: PositiveFloat = Field(default=1.0, description="mean depths; damps what nothing speaks for")
     lattice_px: PositiveInt = Field(default=8, description="view pixels between the flow cells that take part")
+    min_inlier_share: float = Field(default=0.15, ge=0, le=1, description="below it the answer says motion_unconfirmed")
     min_confidence: float = Field(
         default=0.002, ge=0, le=1, description="mean of the cells' confidence below which nothing is corrected"
     )

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 
 from viflow_anomaly.checkpoint_record import CheckpointRecord
-from viflow_anomaly.config import DetectorConfig, RuntimeName
+from viflow_anomaly.config import CorrectionConfig, DetectorConfig, RuntimeName
+from viflow_anomaly.correction import Correction
 from viflow_anomaly.detection import (
     AnalyzedRegion,
     Detection,
@@ -137,6 +138,8 @@ class AnomalyDetector:
         reasons, abstained = self._judge_input(pair, model_input)
         if summary is None:
             reasons, abstained = (*reasons, NOTHING_IN_COMMON), True
+        elif not abstained:
+            reasons = (*reasons, *_doubts(predicted.correction, self.config.correction))
         rois: tuple[Roi, ...] = ()
         if not abstained:
             image = ImageSize(width=residual.shape[1], height=residual.shape[0])
@@ -194,6 +197,18 @@ class AnomalyDetector:
                 )
             )
         return tuple(reasons), abstained
+
+
+def _doubts(correction: Correction | None, config: CorrectionConfig) -> tuple[Reason, ...]:
+    """What the attempt to correct the motion on the target image says against the answer."""
+    if correction is None or (correction.converged and correction.inlier_share >= config.min_inlier_share):
+        return ()
+    if correction.converged:
+        found = f"found that {100 * correction.inlier_share:.0f} % agree with any motion of the camera"
+    else:
+        found = "found too little texture in common, or no better motion; the prediction stands as it was"
+    wanted = f"expected at least {100 * config.min_inlier_share:.0f} % of what can be measured between the images"
+    return (Reason(code="motion_unconfirmed", message=f"{wanted} to confirm the camera's motion, {found}"),)
 
 
 def _summary(
