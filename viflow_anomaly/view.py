@@ -221,7 +221,6 @@ def make_view(config: ViewConfig, *, width: int, height: int, camera: PinholeCam
         return _crop_view(config, width, height)
     if camera is None:
         return _shrunk_view(config, width, height)
-    # What the view depends on; the mounting and the clock may differ.
     # What a view depends on: cameras that differ in their mounting or clock alone share one.
     key = (camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion_model, camera.distortion_coeffs)
     return _VIEWS.get(
