@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import pytest
 
 from viflow_anomaly.config import CorrectionConfig
 from viflow_anomaly.correction import (
     RigidMotion,
     correct_flow,
     correct_motion,
-    nearest_hypothesis,
     rigid_flow_px,
 )
 from viflow_anomaly.geometry import Float32Array, rigid_motion_flow, so3_exp, so3_log
@@ -140,16 +138,6 @@ def test_a_rotation_the_hypotheses_lack_is_found() -> None:
         RAYS, np.zeros((1, ROWS, COLUMNS, 2), np.float32), 0, measured, FOCAL_PX, CorrectionConfig()
     )
     assert np.linalg.norm(corrected.flow_px - flow, axis=-1).mean() < 0.15 * np.linalg.norm(flow, axis=-1).mean()
-
-
-@pytest.mark.parametrize("true", range(3))
-def test_the_nearest_hypothesis_ignores_a_mover(true: int) -> None:
-    shifts = np.array([(0.0, 0.0), (4.0, 0.0), (0.0, -5.0)], dtype=np.float32)
-    hypotheses = np.broadcast_to(shifts[:, None, None], (3, ROWS, COLUMNS, 2))
-    flow = np.array(hypotheses[true])
-    flow[:12, :20] = 30.0
-    measured = MeasuredFlow(flow, np.ones((ROWS, COLUMNS), np.float32), STRIDE)
-    assert nearest_hypothesis(hypotheses, measured, CorrectionConfig()) == true
 
 
 def test_the_same_input_gives_the_same_bytes() -> None:

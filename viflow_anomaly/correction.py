@@ -90,7 +90,7 @@ def correct_motion(
     Args:
         rays: [h, w, 2] of each cell, in focal lengths.
         inverse_depth: [h, w].
-        start: the IMU's rotation and the translation of the nearest hypothesis.
+        start: the IMU's rotation and the winning hypothesis' translation.
         measured: on the same cells.
         focal_px: of the view.
         config: how far and how hard.
@@ -177,18 +177,6 @@ def correct_flow(
         solution = _weighted_step(jacobian, goal, weights, prior, np.zeros(len(prior)))
     shift = np.tensordot(solution.astype(np.float32), basis, (0, 1)).transpose(1, 2, 0)
     return _accepted(start, start + shift * np.float32(focal_px), measured, config, None, None)
-
-
-def nearest_hypothesis(hypotheses_px: Float32Array, measured: MeasuredFlow, config: CorrectionConfig) -> int:
-    """The hypothesis [K, h, w, 2] that most of the measured flow agrees with: where a correction starts."""
-    if len(hypotheses_px) == 1:
-        return 0
-    thin = _lattice(measured, config)
-    error = (hypotheses_px[:, *thin] - measured.flow_px[thin]).reshape(len(hypotheses_px), -1, 2)
-    confidence = measured.confidence[thin].reshape(-1)
-    squared = np.square(error).sum(axis=-1)
-    cost = np.log1p(squared / np.float32((3 * config.tolerance_px) ** 2)) @ confidence
-    return int(np.argmin(cost))
 
 
 def _lattice(measured: MeasuredFlow, config: CorrectionConfig) -> tuple[slice, slice]:

@@ -7,10 +7,11 @@ The measurement corrects the network's prediction (``correction``); it never rep
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from viflow_anomaly.geometry import Float32Array, pixel_grid
 from viflow_anomaly.sensor_data import Uint8Array
@@ -41,11 +42,25 @@ class MeasuredFlow(NamedTuple):
     stride: int
 
 
-def measure_flow(source: Uint8Array, target: Uint8Array, *, stride: int, thorough: bool = False) -> MeasuredFlow:
-    """Measure the flow between two views [H, W]; sides are multiples of ``stride``, and even.
+def measure_flow(
+    source: Uint8Array,
+    target: Uint8Array,
+    *,
+    stride: int,
+    around: Float32Array | None = None,
+    thorough: bool = False,
+) -> MeasuredFlow:
+    """Measure the flow between two views.
 
-    Source: Kroeger et al., Fast Optical Flow using Dense Inverse Search (ECCV 2016); OpenCV's preset "ultrafast" (or
-    "medium", ``thorough``, at three times the time), one level finer, because views are small.
+    Args:
+        source, target: [H, W]; sides are multiples of ``stride``, and even.
+        stride: pixels for one cell of the result.
+        around: [h, w, 2] a flow on the cells from which the search starts; None: from no motion. A motion of more than
+            some ten pixels is found from a guess only.
+        thorough: better where texture is weak, at three times the time.
+
+    Source: Kroeger et al., Fast Optical Flow using Dense Inverse Search (ECCV 2016); OpenCV's preset "ultrafast"
+    ("medium" if ``thorough``), one level finer, because views are small.
     """
     height, width = source.shape
     cells = (width // stride, height // stride)
@@ -54,21 +69,36 @@ def measure_flow(source: Uint8Array, target: Uint8Array, *, stride: int, thoroug
     fast, slow = cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST, cv2.DISOPTICAL_FLOW_PRESET_MEDIUM
     search = cv2.DISOpticalFlow_create(slow if thorough else fast)  # type: ignore[attr-defined]
     search.setFinestScale(FINEST_SCALE)
-    flow = search.calc(source, target, None)
+    if around is None:
+        flow = search.calc(source, target, None)
+    else:
+        guess = cv2.resize(around, (width, height), interpolation=cv2.INTER_LINEAR)
+        grid = _grid(height, width)
+        flow = search.calc(source, _sampled(target, grid + guess), None)
+        flow = flow + _sampled(guess, grid + flow)  # where a pixel of the moved target came from
     flow_px = np.asarray(cv2.resize(flow, cells, interpolation=cv2.INTER_AREA), dtype=np.float32)
+    return MeasuredFlow(flow_px, _confidence(source, target, flow, cells), stride)
+
+
+def _confidence(source: Uint8Array, target: Uint8Array, flow_px: Float32Array, cells: tuple[int, int]) -> Float32Array:
+    """[h, w] in 0..1: texture to measure by, and photometric agreement after the flow, on the halved views."""
+    height, width = source.shape
     half = (width // 2, height // 2)
     small_source, small_target = (
         np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), dtype=np.uint8) for image in (source, target)
     )
-    at = cv2.resize(flow, half, interpolation=cv2.INTER_NEAREST) * np.float32(0.5) + _grid(half[1], half[0])
-    matched = cv2.remap(  # type: ignore[call-overload]  # the stubs lack the two-channel map
-        small_target, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0
-    )
+    at = cv2.resize(flow_px, half, interpolation=cv2.INTER_NEAREST) * np.float32(0.5) + _grid(half[1], half[0])
+    matched = _sampled(small_target, at, border=cv2.BORDER_CONSTANT)
     mismatch = cv2.resize(cv2.absdiff(matched, small_source), cells, interpolation=cv2.INTER_AREA)
     mismatch = mismatch * np.float32(1 / MISMATCH_GRAY)
     texture = _texture(small_source, cells)
-    confidence = texture / ((texture + np.float32(TEXTURE_GRAY2)) * (1 + mismatch * mismatch))
-    return MeasuredFlow(flow_px, np.asarray(confidence, dtype=np.float32), stride)
+    return np.asarray(texture / ((texture + np.float32(TEXTURE_GRAY2)) * (1 + mismatch * mismatch)), dtype=np.float32)
+
+
+def _sampled(array: NDArray[Any], at_px: Float32Array, *, border: int = cv2.BORDER_REPLICATE) -> NDArray[Any]:
+    return cv2.remap(  # type: ignore[call-overload, no-any-return]  # the stubs lack the two-channel map
+        array, at_px, None, cv2.INTER_LINEAR, borderMode=border, borderValue=0
+    )
 
 
 @lru_cache(maxsize=8)

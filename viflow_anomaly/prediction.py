@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from viflow_anomaly.config import CorrectionConfig
-from viflow_anomaly.correction import Correction, correct_flow, correct_motion, nearest_hypothesis
+from viflow_anomaly.correction import Correction, correct_flow, correct_motion
 from viflow_anomaly.geometry import Float32Array, pixel_grid
 from viflow_anomaly.measured_flow import MeasuredFlow, measure_flow
 from viflow_anomaly.model_input import ModelInput
@@ -49,8 +49,8 @@ def predict_flow(
     Args:
         runtime: of the network.
         model_input: the pair.
-        config: of the correction, which starts at the hypothesis nearest to the measured flow. Off: the hypothesis that
-            reconstructs the source best stands as the network predicted it (the paper's method).
+        config: of the correction, which starts at the hypothesis that reconstructs the source best. Off: that
+            hypothesis stands as the network predicted it (the paper's method).
         focal_px: of the view.
     """
     return correct(runtime.predict(model_input), model_input, config, focal_px=focal_px)
@@ -61,12 +61,11 @@ def correct(
 ) -> PredictedFlow:
     """Choose a hypothesis and correct it; arguments as in ``predict_flow``."""
     stride = hypotheses.stride
-    if not config.enabled:
-        winner = choose_hypothesis(hypotheses, model_input.source, model_input.target)
-        return PredictedFlow(hypotheses.flow_px[winner], stride, winner, hypotheses.flow_px[winner], None, None)
-    measured = measure_flow(model_input.source, model_input.target, stride=stride)
-    winner = nearest_hypothesis(hypotheses.flow_px, measured, config)
+    winner = choose_hypothesis(hypotheses, model_input.source, model_input.target)
     predicted = hypotheses.flow_px[winner]
+    if not config.enabled:
+        return PredictedFlow(predicted, stride, winner, predicted, None, None)
+    measured = measure_flow(model_input.source, model_input.target, stride=stride, around=predicted)
     rays = view_rays(*predicted.shape[:2], stride, *model_input.source.shape, focal_px)
     if hypotheses.scene is None:
         correction = correct_flow(rays, hypotheses.flow_px, winner, measured, focal_px, config)
@@ -97,13 +96,24 @@ def choose_hypothesis(hypotheses: Hypotheses, source: Uint8Array, target: Uint8A
     shrink = max(stride, SELECTION_STRIDE_PX)
     size = (source.shape[1] // shrink, source.shape[0] // shrink)
     small_source, small_target = (_normalised(image, size, shrink) for image in (source, target))
-    unmoved = _charbonnier(small_target, small_source)
-    grid = pixel_grid(size[1], size[0])
-    errors = [
-        _reconstruction_error(_shrunk(one, size, shrink // stride), grid, small_source, small_target, unmoved, shrink)
-        for one in flow_px
-    ]
+    at = np.stack([_shrunk(one, size, shrink // stride) for one in flow_px]) * np.float32(1 / shrink)
+    at += view_grid(size[1], size[0])  # K, h, w, 2
+    tall = at.reshape(-1, size[0], 2)
+    inside = cv2.inRange(tall, (0.0, 0.0), (size[0] - 1.0, size[1] - 1.0)).reshape(at.shape[:3]) != 0
+    sampled = cv2.remap(  # type: ignore[call-overload]  # the stubs lack the two-channel map
+        small_target, tall, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    ).reshape(at.shape[:3])
+    difference = np.where(inside, sampled, small_target) - small_source
+    errors = np.sqrt(difference * difference + np.float32(CHARBONNIER_EPSILON**2)).mean(axis=(1, 2))
     return int(np.argmin(errors))
+
+
+@lru_cache(maxsize=16)
+def view_grid(rows: int, columns: int) -> Float32Array:
+    """Read-only ``pixel_grid`` of a small picture."""
+    grid = pixel_grid(rows, columns)
+    grid.setflags(write=False)
+    return grid
 
 
 def _normalised(image: Uint8Array, size: tuple[int, int], shrink: int) -> Float32Array:
@@ -117,24 +127,3 @@ def _normalised(image: Uint8Array, size: tuple[int, int], shrink: int) -> Float3
 def _shrunk(flow_px: Float32Array, size: tuple[int, int], factor: int) -> Float32Array:
     whole = flow_px[: size[1] * factor, : size[0] * factor]
     return whole if factor == 1 else np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.float32)
-
-
-def _charbonnier(first: Float32Array, second: Float32Array) -> Float32Array:
-    return np.asarray(np.sqrt(np.square(first - second) + np.float32(CHARBONNIER_EPSILON**2)), dtype=np.float32)
-
-
-def _reconstruction_error(
-    flow_px: Float32Array,
-    grid: Float32Array,
-    source: Float32Array,
-    target: Float32Array,
-    unmoved: Float32Array,
-    shrink: int,
-) -> float:
-    at = grid + flow_px / np.float32(shrink)
-    height, width = source.shape
-    inside = cv2.inRange(at, (0.0, 0.0), (width - 1.0, height - 1.0)) != 0
-    sampled = cv2.remap(  # type: ignore[call-overload]  # the stubs lack the two-channel map
-        target, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
-    return float(np.where(inside, _charbonnier(sampled, source), unmoved).mean())
