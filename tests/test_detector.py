@@ -232,6 +232,24 @@ def test_the_papers_crop_is_an_option(tmp_path: Path) -> None:
     assert caught.value.code == "image_smaller_than_crop"
 
 
+def test_a_crop_is_corrected_at_the_cameras_focal_length(tmp_path: Path) -> None:
+    """The crop is not resampled: its focal length is the camera's (232 px), not the view's of other models (116)."""
+    config = ModelConfig(preset="compact", view=ViewConfig(mode="center_crop"))
+    network = build_model(config)
+    assert isinstance(network, CompactViflow)
+    with torch.no_grad():
+        for part in (network.global_head, network.local_head, network.mounting):
+            part.weight.zero_()
+    path = save_checkpoint(tmp_path / "crop.safetensors", network, config, name="crop", version="0")
+    rate = (0.15, 0.25, -0.1)
+    analysis = AnomalyDetector.from_checkpoint(path).analyze(pair(texture(2), turned(texture(2), rate)))
+    correction = analysis.predicted.correction
+    assert correction is not None
+    assert correction.inlier_share > 0.8
+    assert analysis.detection.residual is not None
+    assert analysis.detection.residual.median < 2.0
+
+
 def test_a_gyro_only_sensor_is_told_what_is_missing(detector: AnomalyDetector) -> None:
     still = texture(14)
     samples = imu()

@@ -10,6 +10,7 @@ from hypothesis.extra.numpy import arrays
 from pydantic import ValidationError
 
 from viflow_anomaly.config import RegionConfig
+from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.regions import BoundingBox, Region, RegionResult, find_regions
 
 # Nothing is smoothed or cleaned, so that a drawing means its pixels; the shape rule keeps its defaults.
@@ -401,3 +402,10 @@ def test_the_number_of_regions_is_bounded(count: int) -> None:
     """Components are ranked in 16 bits, and each one costs time that a request must not be able to ask for."""
     with pytest.raises(ValidationError, match="max_regions"):
         RegionConfig(max_regions=count)
+
+
+@pytest.mark.parametrize("softening_gray", [1e-42, 0.05])
+def test_a_softening_that_would_divide_by_nothing_is_refused(softening_gray: float) -> None:
+    with pytest.raises(ConfigError, match=r"expected 0 or at least 0\.1"):
+        RegionConfig.from_mapping({"texture_softening_gray": softening_gray}, where="test")
+    assert RegionConfig(texture_softening_gray=0).texture_softening_gray == 0

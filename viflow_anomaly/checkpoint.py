@@ -54,6 +54,7 @@ def save_checkpoint(
         model=config,
         provenance=dict(provenance or {}),
     )
+    path.with_suffix(".onnx").unlink(missing_ok=True)  # an export of what was here before
     write_atomically(path, data)
     write_atomically(path.with_suffix(".json"), (record.model_dump_json(indent=2) + "\n").encode())
     return path

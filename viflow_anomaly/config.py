@@ -111,6 +111,9 @@ class ModelConfig(FrozenConfig):
         return self
 
 
+MIN_SOFTENING_GRAY = 0.1
+
+
 class RegionConfig(FrozenConfig):
     """From residual map to labelled regions; see ``regions.py`` for each step.
 
@@ -131,6 +134,15 @@ class RegionConfig(FrozenConfig):
     min_y_extent_fraction: float = Field(default=0.018, ge=0, le=1, description="of the diagonal: narrower is a band")
     max_aspect_ratio: float = Field(default=5.0, ge=1, description="a longer bounding box is a band")
 
+    @model_validator(mode="after")
+    def _softening_is_none_or_visible(self) -> Self:
+        if 0 < self.texture_softening_gray < MIN_SOFTENING_GRAY:
+            raise ValueError(
+                f"texture_softening_gray: expected 0 or at least {MIN_SOFTENING_GRAY}, "
+                f"found {self.texture_softening_gray}"
+            )
+        return self
+
 
 RuntimeName = Literal["auto", "torch", "openvino"]
 """What runs the network: "auto" is OpenVINO on a CPU where it is installed and the checkpoint was exported."""
@@ -141,9 +153,15 @@ class CorrectionConfig(FrozenConfig):
 
     enabled: bool = True
     rounds: int = Field(default=4, ge=1, le=50)
-    tolerance_px: PositiveFloat = Field(default=0.7, description="view pixels at which a cell's weight is halved")
-    rotation_sigma_rad: PositiveFloat = Field(default=0.004, description="how far the gyro's rotation may be off")
-    translation_sigma: PositiveFloat = Field(default=1.0, description="mean depths; damps what nothing speaks for")
+    tolerance_px: float = Field(
+        default=0.7, ge=0.01, le=100, description="view pixels at which a cell's weight is halved"
+    )
+    rotation_sigma_rad: float = Field(
+        default=0.004, ge=1e-6, le=10, description="how far the gyro's rotation may be off"
+    )
+    translation_sigma: float = Field(
+        default=1.0, ge=1e-6, le=1e3, description="view's unit; damps what nothing speaks for"
+    )
     lattice_px: PositiveInt = Field(default=8, description="view pixels between the flow cells that take part")
     min_inlier_share: float = Field(default=0.15, ge=0, le=1, description="below it the answer says motion_unconfirmed")
     min_confidence: float = Field(

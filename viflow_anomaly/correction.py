@@ -40,9 +40,9 @@ class Correction(NamedTuple):
     Attributes:
         flow_px: [h, w, 2] float32.
         motion: the corrected camera motion, None where the network gives flow only.
-        inlier_share: confident cells that agree with the corrected flow, 0..1; 0 where nothing was confident.
+        inlier_share: confident cells that agree with ``flow_px``, 0..1; 0 where too little was confident.
         shift_px: how far the correction moved the prediction, |du| + |dv|, mean over cells.
-        converged: False: the prediction stands as it was.
+        converged: False: nothing to measure, or the prediction was no worse; it stands as it was.
     """
 
     flow_px: Float32Array
@@ -227,7 +227,7 @@ def _accepted(
     def inliers(flow: Float32Array) -> float:
         error = (measured.flow_px[thin] - flow[thin]).reshape(-1, 2).T
         weights = robust_weights(error, confidence.reshape(-1), config.tolerance_px)
-        return float(weights.sum()) / total if total > 0 else 0.0
+        return float(weights.sum()) / total if total > enough else 0.0
 
     share, share_before = inliers(after), inliers(before)
     converged = total > enough and share >= share_before and bool(np.isfinite(after[thin]).all())

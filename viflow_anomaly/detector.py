@@ -8,6 +8,7 @@ from typing import NamedTuple, Self
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from viflow_anomaly.checkpoint_record import CheckpointRecord
 from viflow_anomaly.config import CorrectionConfig, DetectorConfig, RuntimeName
@@ -45,6 +46,8 @@ class Analysis(NamedTuple):
     Attributes:
         detection: what ``detect`` returns.
         residual: [H, W] float32 photometric residual in gray levels at the source image's size.
+        evidence: [H, W] float32 what regions are found in: the residual, normalised by texture.
+        inside: [H, W] analysed pixels that are still in the target image; elsewhere nothing is found.
         reconstruction: [H, W] float32 source image rebuilt from the target.
         target_coordinates: [H, W, 2] float32 where each source pixel is predicted in the target image.
         predicted: the flow they come from, in the network's view, and its correction.
@@ -52,6 +55,8 @@ class Analysis(NamedTuple):
 
     detection: Detection
     residual: Float32Array
+    evidence: Float32Array
+    inside: NDArray[np.bool_]
     reconstruction: Float32Array
     target_coordinates: Float32Array
     predicted: PredictedFlow
@@ -94,7 +99,7 @@ class AnomalyDetector:
             config: thresholds and shape rule.
             device: torch device name; another one than "cpu" needs the torch runtime.
             runtime: "auto" takes OpenVINO where it is installed and the checkpoint was exported, else torch.
-            threads: CPU threads of the network (torch: of the whole process); None leaves the backend's own.
+            threads: CPU threads of the network (torch: of the whole process); None: torch's own, one in OpenVINO.
 
         Raises:
             CheckpointError: as ``load_runtime``.
@@ -132,6 +137,7 @@ class AnomalyDetector:
         if (analyzed := model_input.view.analyzed()) is not None:
             inside &= analyzed
         residual = photometric_residual(pair.source.image, reconstruction, inside)
+        evidence = texture_normalised(residual, pair.source.image, self.config.regions.texture_softening_gray)
         inferred = time.perf_counter()
         x, y, region_width, region_height = model_input.view.region()
         summary = _summary(residual, inside, self.config.min_overlap, region_width * region_height)
@@ -143,9 +149,7 @@ class AnomalyDetector:
         rois: tuple[Roi, ...] = ()
         if not abstained:
             image = ImageSize(width=residual.shape[1], height=residual.shape[0])
-            config = self.config.regions
-            evidence = texture_normalised(residual, pair.source.image, config.texture_softening_gray)
-            regions = find_regions(evidence, inside, config, residual=residual).regions
+            regions = find_regions(evidence, inside, self.config.regions, residual=residual).regions
             rois = rois_from_regions(regions, image, include_masks=self.config.include_masks)
         finished = time.perf_counter()
         timings_ms = {
@@ -167,7 +171,7 @@ class AnomalyDetector:
             residual=summary,
             timings_ms=timings_ms,
         )
-        return Analysis(detection, residual, reconstruction, coordinates, predicted)
+        return Analysis(detection, residual, evidence, inside, reconstruction, coordinates, predicted)
 
     def _judge_input(self, pair: FramePair, model_input: ModelInput) -> tuple[tuple[Reason, ...], bool]:
         """What lowers trust in this pair, and whether it must not be judged."""
@@ -201,18 +205,18 @@ class AnomalyDetector:
 
 def _doubts(correction: Correction | None, config: CorrectionConfig) -> tuple[Reason, ...]:
     """What the attempt to correct the motion on the target image says against the answer."""
-    if correction is None or (correction.converged and correction.inlier_share >= config.min_inlier_share):
+    if correction is None or correction.inlier_share >= config.min_inlier_share:
         return ()
-    if correction.converged:
+    if correction.inlier_share:
         found = f"found that {100 * correction.inlier_share:.0f} % agree with any motion of the camera"
     else:
-        found = "found too little texture in common, or no better motion; the prediction stands as it was"
+        found = "found too little texture in common; the prediction stands as it was"
     wanted = f"expected at least {100 * config.min_inlier_share:.0f} % of what can be measured between the images"
     return (Reason(code="motion_unconfirmed", message=f"{wanted} to confirm the camera's motion, {found}"),)
 
 
 def _summary(
-    residual: Float32Array, inside: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], min_share: float, analyzed_px: int
+    residual: Float32Array, inside: NDArray[np.bool_], min_share: float, analyzed_px: int
 ) -> ResidualSummary | None:
     """None where less than ``min_share`` of the analysed pixels are still in the target image."""
     min_values = min_share * analyzed_px / RESIDUAL_SAMPLE_STRIDE**2

@@ -5,6 +5,7 @@ Frames: camera x right, y down, z forward. ``T_a_b`` maps coordinates in b to a.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -52,11 +53,19 @@ def pixel_grid(height: int, width: int) -> Float32Array:
     return np.stack([u, v], axis=-1)
 
 
-def sample_bilinear(array: NDArray[Any], at_px: Float32Array) -> NDArray[Any]:
-    """Bilinear samples of [H, W(, C)] at [h, w, 2] pixel coordinates; the border is repeated."""
+def sample_bilinear(array: NDArray[Any], at_px: Float32Array, *, border: int = cv2.BORDER_REPLICATE) -> NDArray[Any]:
+    """Bilinear samples of [H, W(, C)] at [h, w, 2] pixel coordinates; the border is repeated (BORDER_CONSTANT: 0)."""
     return cv2.remap(  # type: ignore[call-overload, no-any-return]  # the stubs lack the two-channel map
-        array, at_px, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        array, at_px, None, cv2.INTER_LINEAR, borderMode=border, borderValue=0
     )
+
+
+@lru_cache(maxsize=32)
+def small_pixel_grid(height: int, width: int) -> Float32Array:
+    """Read-only ``pixel_grid`` of a view, made once; for images of any size it would hold too much."""
+    grid = pixel_grid(height, width)
+    grid.setflags(write=False)
+    return grid
 
 
 def _distort(

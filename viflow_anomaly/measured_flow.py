@@ -6,14 +6,12 @@ The measurement corrects the network's prediction (``correction``); it never rep
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from viflow_anomaly.geometry import Float32Array, pixel_grid
+from viflow_anomaly.geometry import Float32Array, sample_bilinear, small_pixel_grid
 from viflow_anomaly.sensor_data import Uint8Array
 
 TEXTURE_GRAY2 = 2.0
@@ -79,9 +77,9 @@ def measure_flow(
         flow = search.calc(source, target, None)
     else:
         guess = cv2.resize(around, (width, height), interpolation=cv2.INTER_LINEAR)
-        grid = _grid(height, width)
-        flow = search.calc(source, _sampled(target, grid + guess), None)
-        flow = flow + _sampled(guess, grid + flow)  # where a pixel of the moved target came from
+        grid = small_pixel_grid(height, width)
+        flow = search.calc(source, sample_bilinear(target, grid + guess), None)
+        flow = flow + sample_bilinear(guess, grid + flow)  # where a pixel of the moved target came from
     flow_px = np.asarray(cv2.resize(flow, cells, interpolation=cv2.INTER_AREA), dtype=np.float32)
     return MeasuredFlow(flow_px, _confidence(source, target, flow, cells), stride)
 
@@ -93,25 +91,14 @@ def _confidence(source: Uint8Array, target: Uint8Array, flow_px: Float32Array, c
     small_source, small_target = (
         np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), dtype=np.uint8) for image in (source, target)
     )
-    at = cv2.resize(flow_px, half, interpolation=cv2.INTER_NEAREST) * np.float32(0.5) + _grid(half[1], half[0])
-    matched = _sampled(small_target, at, border=cv2.BORDER_CONSTANT)
+    at = cv2.resize(flow_px, half, interpolation=cv2.INTER_NEAREST) * np.float32(0.5) + small_pixel_grid(
+        half[1], half[0]
+    )
+    matched = sample_bilinear(small_target, at, border=cv2.BORDER_CONSTANT)
     mismatch = cv2.resize(cv2.absdiff(matched, small_source), cells, interpolation=cv2.INTER_AREA)
     mismatch = mismatch * np.float32(1 / MISMATCH_GRAY)
     texture = _texture(small_source, cells)
     return np.asarray(texture / ((texture + np.float32(TEXTURE_GRAY2)) * (1 + mismatch * mismatch)), dtype=np.float32)
-
-
-def _sampled(array: NDArray[Any], at_px: Float32Array, *, border: int = cv2.BORDER_REPLICATE) -> NDArray[Any]:
-    return cv2.remap(  # type: ignore[call-overload, no-any-return]  # the stubs lack the two-channel map
-        array, at_px, None, cv2.INTER_LINEAR, borderMode=border, borderValue=0
-    )
-
-
-@lru_cache(maxsize=8)
-def _grid(height: int, width: int) -> Float32Array:
-    grid = pixel_grid(height, width)
-    grid.setflags(write=False)
-    return grid
 
 
 def _texture(image: Uint8Array, cells: tuple[int, int]) -> Float32Array:

@@ -10,7 +10,7 @@ import numpy as np
 
 from viflow_anomaly.config import CorrectionConfig
 from viflow_anomaly.correction import Correction, correct_flow, correct_motion
-from viflow_anomaly.geometry import Float32Array, pixel_grid
+from viflow_anomaly.geometry import Float32Array, pixel_grid, sample_bilinear, small_pixel_grid
 from viflow_anomaly.measured_flow import MeasuredFlow, measure_flow
 from viflow_anomaly.model_input import ModelInput
 from viflow_anomaly.runtime.interface import Hypotheses, Runtime
@@ -51,7 +51,7 @@ def predict_flow(
         model_input: the pair.
         config: of the correction, which starts at the hypothesis that reconstructs the source best. Off: that
             hypothesis stands as the network predicted it (the paper's method).
-        focal_px: of the view.
+        focal_px: that the network takes the view for.
     """
     return correct(runtime.predict(model_input), model_input, config, focal_px=focal_px)
 
@@ -66,11 +66,12 @@ def correct(
     if not config.enabled:
         return PredictedFlow(predicted, stride, winner, predicted, None, None)
     measured = measure_flow(model_input.source, model_input.target, stride=stride, around=predicted)
+    scene = hypotheses.scene
+    focal_px = model_input.view.focal_px if scene is None else focal_px  # a scene's flow is in the network's own
     rays = view_rays(*predicted.shape[:2], stride, *model_input.source.shape, focal_px)
-    if hypotheses.scene is None:
+    if scene is None:
         correction = correct_flow(rays, hypotheses.flow_px, winner, measured, focal_px, config)
     else:
-        scene = hypotheses.scene
         correction = correct_motion(rays, scene.inverse_depth, scene.motion(winner), measured, focal_px, config)
     return PredictedFlow(correction.flow_px, stride, winner, predicted, correction, measured)
 
@@ -97,23 +98,13 @@ def choose_hypothesis(hypotheses: Hypotheses, source: Uint8Array, target: Uint8A
     size = (source.shape[1] // shrink, source.shape[0] // shrink)
     small_source, small_target = (_normalised(image, size, shrink) for image in (source, target))
     at = np.stack([_shrunk(one, size, shrink // stride) for one in flow_px]) * np.float32(1 / shrink)
-    at += view_grid(size[1], size[0])  # K, h, w, 2
+    at += small_pixel_grid(size[1], size[0])  # K, h, w, 2
     tall = at.reshape(-1, size[0], 2)
     inside = cv2.inRange(tall, (0.0, 0.0), (size[0] - 1.0, size[1] - 1.0)).reshape(at.shape[:3]) != 0
-    sampled = cv2.remap(  # type: ignore[call-overload]  # the stubs lack the two-channel map
-        small_target, tall, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    ).reshape(at.shape[:3])
+    sampled = sample_bilinear(small_target, tall).reshape(at.shape[:3])
     difference = np.where(inside, sampled, small_target) - small_source
     errors = np.sqrt(difference * difference + np.float32(CHARBONNIER_EPSILON**2)).mean(axis=(1, 2))
     return int(np.argmin(errors))
-
-
-@lru_cache(maxsize=16)
-def view_grid(rows: int, columns: int) -> Float32Array:
-    """Read-only ``pixel_grid`` of a small picture."""
-    grid = pixel_grid(rows, columns)
-    grid.setflags(write=False)
-    return grid
 
 
 def _normalised(image: Uint8Array, size: tuple[int, int], shrink: int) -> Float32Array:

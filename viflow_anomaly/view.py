@@ -46,6 +46,7 @@ class InternalView:
         source_width, source_height: of the image as it was sent.
         step_px: (x, y) source pixels for one view pixel.
         center_px: (u, v) source pixel in the middle of the view.
+        focal_px: of the view; the configuration's where no camera says another one.
         lens: how the source's distortion is undone, else None.
     """
 
@@ -55,6 +56,7 @@ class InternalView:
     source_height: int
     step_px: tuple[float, float]
     center_px: tuple[float, float]
+    focal_px: float
     lens: LensMaps | None = None
 
     @property
@@ -218,7 +220,7 @@ def make_view(config: ViewConfig, *, width: int, height: int, camera: PinholeCam
             field="image",
         )
     if config.mode == "center_crop":
-        return _crop_view(config, width, height)
+        return _crop_view(config, width, height, camera)
     if camera is None:
         return _shrunk_view(config, width, height)
     # What a view depends on: cameras that differ in their mounting or clock alone share one.
@@ -230,7 +232,7 @@ def make_view(config: ViewConfig, *, width: int, height: int, camera: PinholeCam
     )
 
 
-def _crop_view(config: ViewConfig, width: int, height: int) -> InternalView:
+def _crop_view(config: ViewConfig, width: int, height: int, camera: PinholeCamera | None) -> InternalView:
     side = config.crop_size
     if width < side or height < side:
         raise InvalidInputError(
@@ -240,13 +242,16 @@ def _crop_view(config: ViewConfig, width: int, height: int) -> InternalView:
         )
     x, y = (width - side) // 2, (height - side) // 2
     center = (x + (side - 1) / 2, y + (side - 1) / 2)
-    return InternalView(side, side, width, height, (1.0, 1.0), center)
+    focal_px = config.focal_px if camera is None else camera.fx
+    return InternalView(side, side, width, height, (1.0, 1.0), center, focal_px)
 
 
 def _shrunk_view(config: ViewConfig, width: int, height: int) -> InternalView:
     step = max(1.0, width / config.max_width, height / config.max_height)
     center = ((width - 1) / 2, (height - 1) / 2)
-    return InternalView(_padded(width / step), _padded(height / step), width, height, (step, step), center)
+    return InternalView(
+        _padded(width / step), _padded(height / step), width, height, (step, step), center, config.focal_px
+    )
 
 
 _CameraKey = tuple[float, float, float, float, DistortionModel, tuple[float, ...]]
@@ -266,6 +271,7 @@ def _pinhole_view(config: ViewConfig, width: int, height: int, key: _CameraKey) 
         height,
         (fx / config.focal_px, fy / config.focal_px),
         (cx, cy),
+        config.focal_px,
     )
     if rays is not None:
         lens = solve_lens_maps(camera, rays, width=view.width, height=view.height, step_px=view.step_px)

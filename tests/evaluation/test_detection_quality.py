@@ -99,6 +99,8 @@ def test_ours_and_all_rivals_are_measured_by_group(detector: AnomalyDetector, tm
 
 
 def test_a_recording_without_ground_truth_is_refused(detector: AnomalyDetector, tmp_path: Path) -> None:
-    with pytest.raises(DatasetError) as caught:
-        measure_detection(detector, [write_euroc(tmp_path / "V1_01")])
-    assert caught.value.code == "ground_truth_missing"
+    alone = add_movers(add_ground_truth(tmp_path / "drone_1", make_world(frames=1)))
+    for folder in (write_euroc(tmp_path / "V1_01"), alone):
+        with pytest.raises(DatasetError) as caught:
+            measure_detection(detector, [folder])
+        assert caught.value.code == "ground_truth_missing"

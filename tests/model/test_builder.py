@@ -56,6 +56,14 @@ def test_paper_is_built_as_configured() -> None:
     assert flow.shape == (2, 4, 2, 64, 64)
 
 
+@pytest.mark.parametrize("preset", ["compact", "calibrated"])
+def test_a_crop_of_broken_cells_is_refused(preset: Literal["compact", "calibrated"]) -> None:
+    config = ModelConfig(preset=preset, view=ViewConfig(mode="center_crop", crop_size=100))
+    with pytest.raises(ConfigError, match="multiple of 32, found 100") as caught:
+        build_model(config)
+    assert (caught.value.code, caught.value.field) == ("config_invalid", "view.crop_size")
+
+
 @pytest.mark.parametrize("view", [ViewConfig(mode="whole"), ViewConfig(mode="center_crop", crop_size=225)])
 def test_the_paper_preset_needs_its_crop(view: ViewConfig) -> None:
     with pytest.raises(ConfigError, match=r"needs view\.mode 'center_crop'.*found 'whole' of 224|of 225") as caught:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -107,10 +108,41 @@ def test_openvino_without_an_export_or_on_another_device_is_refused(exported: di
     assert caught.value.code == "runtime_unavailable"
 
 
-def test_an_export_of_other_weights_is_refused(exported: dict[str, Path], tmp_path: Path) -> None:
+def test_an_export_of_other_weights_is_stale(exported: dict[str, Path], tmp_path: Path) -> None:
     path = save(tmp_path, "compact")
     path.with_suffix(".onnx").write_bytes(exported["calibrated"].with_suffix(".onnx").read_bytes())
-    with pytest.raises(CheckpointError, match="expected an export of the weights") as caught:
+    with pytest.raises(CheckpointError, match="viflow-anomaly export --checkpoint") as caught:
+        load_runtime(path)
+    assert caught.value.code == "export_stale"
+
+
+def test_an_export_of_another_configuration_is_stale(exported: dict[str, Path], tmp_path: Path) -> None:
+    path = tmp_path / "compact.safetensors"
+    for suffix in (".safetensors", ".onnx", ".json"):
+        path.with_suffix(suffix).write_bytes(exported["compact"].with_suffix(suffix).read_bytes())
+    record = json.loads(path.with_suffix(".json").read_text())
+    record["model"]["view"]["focal_px"] = 232.0
+    path.with_suffix(".json").write_text(json.dumps(record))
+    with pytest.raises(CheckpointError) as caught:
+        load_runtime(path)
+    assert caught.value.code == "export_stale"
+
+
+def test_a_new_checkpoint_takes_the_old_export_away(tmp_path: Path) -> None:
+    path = save(tmp_path, "compact")
+    export_onnx(path)
+    save(tmp_path, "compact")
+    assert not path.with_suffix(".onnx").exists()
+    assert load_runtime(path).runtime.name == "torch"
+
+
+def test_a_foreign_network_is_refused(exported: dict[str, Path], tmp_path: Path) -> None:
+    onnx = pytest.importorskip("onnx")
+    path = save(tmp_path, "compact")
+    model = onnx.load(str(exported["compact"].with_suffix(".onnx")))
+    del model.metadata_props[:]
+    onnx.save(model, str(path.with_suffix(".onnx")))
+    with pytest.raises(CheckpointError, match="an export of this package") as caught:
         load_runtime(path)
     assert caught.value.code == "checkpoint_corrupt"
 

@@ -14,12 +14,9 @@ import cv2
 import numpy as np
 
 from viflow_anomaly.config import RegionConfig
-from viflow_anomaly.datasets.pairing import RecordingPairs
-from viflow_anomaly.datasets.registry import open_recording
-from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
 from viflow_anomaly.detector import AnomalyDetector
-from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.evaluation.detection_scores import DetectionScores, ScoredBox
+from viflow_anomaly.evaluation.endpoint_error import open_with_ground_truth
 from viflow_anomaly.evaluation.labelled_pairs import BoolArray, Labels, labels_of
 from viflow_anomaly.evaluation.rivals import RIVALS
 from viflow_anomaly.geometry import Float32Array
@@ -53,20 +50,13 @@ def measure_detection(
         on_progress: called with (done, total) after each recording.
 
     Raises:
-        DatasetError: ``ground_truth_missing`` for a recording without ground truth; as ``open_recording``.
+        DatasetError: ``ground_truth_missing`` for a recording without ground truth or pairs, before anything is
+            measured; as ``open_recording``.
     """
     groups: dict[str, dict[str, dict[tuple[float, float], DetectionScores]]] = {}
-    for done, path in enumerate(recordings, start=1):
-        recording = open_recording(path)
-        truth = SimulatedGroundTruth.find(recording.root)
-        if truth is None:
-            raise DatasetError(
-                f"{path}: expected a simulated recording with ground truth (groundtruth0), found none",
-                code="ground_truth_missing",
-                field="recordings",
-            )
-        group = groups.setdefault(recording.name.split("_", 1)[0], {})
-        pairs = RecordingPairs(recording)
+    opened = [open_with_ground_truth(path) for path in recordings]
+    for done, (pairs, truth) in enumerate(opened, start=1):
+        group = groups.setdefault(pairs.recording.name.split("_", 1)[0], {})
         for index in range(0, len(pairs), every):
             pair = pairs[index]
             labels = labels_of(truth, pair.source.timestamp_ns)
@@ -91,7 +81,7 @@ def _add_ours(
     boxes = [(roi.bbox, roi.score) for roi in analysis.detection.rois]
     found = [ScoredBox(BoundingBox(box.x, box.y, box.width, box.height), score) for box, score in boxes]
     scores.add_frame(found, labels)
-    _add_pixels(scores, analysis.residual, np.ones(labels.moving.shape, dtype=np.bool_), labels)
+    _add_pixels(scores, analysis.evidence, analysis.inside, labels)
 
 
 def _add_rivals(

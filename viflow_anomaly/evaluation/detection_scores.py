@@ -18,6 +18,8 @@ MIN_IOU = 0.3
 IGNORED_SHARE = 0.5
 """A region that lies this far in ignored boxes is neither right nor wrong."""
 PIXEL_BINS = 512
+MOTION_SCORE = 0.5
+"""Regions labelled ``independent_motion`` score at least this, others less; curves are over all of them."""
 
 
 class ScoredBox(NamedTuple):
@@ -75,7 +77,7 @@ class DetectionScores:
             "best_f1": _rounded(_best_f1(recall, precision) if self.movers else None),
             "recall_at_0.1_false_alarms": _rounded(self._recall_at(0.1, recall, false_alarms)),
             "recall_at_0.01_false_alarms": _rounded(self._recall_at(0.01, recall, false_alarms)),
-            "false_alarms_per_frame": _rounded(float(false_alarms[-1]) / self.frames if self.frames else None),
+            "false_alarms_per_frame": _rounded(self._alarms() / self.frames if self.frames else None),
             "pixel_ap": _rounded(self._pixel_ap()),
         }
 
@@ -91,6 +93,10 @@ class DetectionScores:
             hits[ends] / np.maximum(ends, 1),
             (ends - hits[ends]).astype(np.float64),
         )
+
+    def _alarms(self) -> int:
+        """False alarms as a user sees them: regions labelled as motion (their score is at least 0.5)."""
+        return sum(not one.hit and one.score >= MOTION_SCORE for one in self.judged)
 
     def _recall_at(
         self, per_frame: float, recall: NDArray[np.float64], false_alarms: NDArray[np.float64]

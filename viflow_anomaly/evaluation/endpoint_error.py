@@ -96,7 +96,7 @@ def measure_endpoint_errors(
     """
     opened: list[tuple[RecordingPairs, SimulatedGroundTruth, int]] = []
     for path in recordings:
-        pairs, truth = _open_with_ground_truth(path)
+        pairs, truth = open_with_ground_truth(path)
         opened += [(pairs, truth, index) for index in range(len(pairs))]
     if max_pairs is not None and len(opened) > max_pairs:
         opened = [opened[k] for k in np.linspace(0, len(opened) - 1, max_pairs).round().astype(int)]
@@ -115,11 +115,16 @@ def require_ground_truth(recordings: Sequence[Path]) -> None:
         DatasetError: as ``measure_endpoint_errors``; only the ground truth of the first pair is read.
     """
     for path in recordings:
-        pairs, truth = _open_with_ground_truth(path)
+        pairs, truth = open_with_ground_truth(path)
         truth.static_flow(*pairs.stamps(0))
 
 
-def _open_with_ground_truth(path: Path) -> tuple[RecordingPairs, SimulatedGroundTruth]:
+def open_with_ground_truth(path: Path) -> tuple[RecordingPairs, SimulatedGroundTruth]:
+    """The adjacent pairs of a simulated recording and its ground truth.
+
+    Raises:
+        DatasetError: ``ground_truth_missing`` without ground truth or pairs; as ``open_recording``.
+    """
     recording = open_recording(path)
     truth = SimulatedGroundTruth.find(recording.root)
     pairs = RecordingPairs(recording)

@@ -9,6 +9,7 @@ from viflow_anomaly.config import ModelConfig
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.model.calibrated import CalibratedViflow
 from viflow_anomaly.model.compact import CompactViflow
+from viflow_anomaly.model.layers import COARSEST_STRIDE
 from viflow_anomaly.model.paper import PaperViflow
 
 CONVOLUTIONAL_PRESETS: dict[
@@ -24,12 +25,13 @@ def build_model(config: ModelConfig, *, seed: int = 0) -> nn.Module:
     """A freshly initialised network; the same seed gives the same weights and leaves the global generator alone.
 
     Raises:
-        ConfigError: ``config_invalid``: the paper preset with a view or window that its fixed sizes cannot take.
+        ConfigError: ``config_invalid``: a crop that is no multiple of 32, or the paper preset without its crop.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         if config.preset == "paper":
             return _build_paper(config)
+        _require_crop_of_whole_cells(config)
         network, widths, motion_width, code_width = CONVOLUTIONAL_PRESETS[config.preset]
         return network(
             widths=widths,
@@ -39,6 +41,16 @@ def build_model(config: ModelConfig, *, seed: int = 0) -> nn.Module:
             interval_rows=config.motion_window.samples_between,
             hypotheses=config.hypotheses,
             focal_px=config.view.focal_px,
+        )
+
+
+def _require_crop_of_whole_cells(config: ModelConfig) -> None:
+    side = config.view.crop_size
+    if config.view.mode == "center_crop" and side % COARSEST_STRIDE:
+        raise ConfigError(
+            f"the {config.preset} preset needs a view.crop_size that is a multiple of {COARSEST_STRIDE}, found {side}",
+            code="config_invalid",
+            field="view.crop_size",
         )
 
 

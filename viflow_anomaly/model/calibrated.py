@@ -20,7 +20,7 @@ from viflow_anomaly.model.layers import FLOW_STRIDE, ConvolutionalViflow, rigid_
 from viflow_anomaly.model.outputs import RigidScene, ViflowOutput
 
 FIRST_SPEED_PER_S = 0.3
-"""Deviation of the untrained hypotheses' velocities along each axis, in mean depths a second."""
+"""Deviation of the untrained hypotheses' velocities along each axis, in the view's unit of length a second."""
 MIN_INVERSE_DEPTH = 1e-3
 """Of the mean, before normalisation: nothing is infinitely far, so the mean is never zero."""
 

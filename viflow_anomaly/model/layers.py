@@ -6,6 +6,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812  # torch's own convention
 from torch import nn
 
+from viflow_anomaly.correction import MIN_DEPTH_RATIO
+
 COARSEST_STRIDE = 32
 FLOW_STRIDE = 4
 
@@ -162,7 +164,7 @@ def rigid_flow(
 
     Args:
         rays: [1, 2, h, w] (x, y) in focal lengths.
-        inverse_depth: [B, 1, h, w] in 1/m; zeros: rotation only.
+        inverse_depth: [B, 1, h, w] in any unit whose inverse the translation has; zeros: rotation only.
         rotation: [B, 3, 3].
         translation: [B, K, 3].
 
@@ -173,7 +175,7 @@ def rigid_flow(
     columns = rotation.float()[..., None, None].unbind(dim=2)  # 3 of B, 3, 1, 1
     moved = columns[0] * rays[:, :1] + columns[1] * rays[:, 1:] + columns[2]
     moved = moved.unsqueeze(1) + inverse_depth.float().unsqueeze(1) * translation.float()[..., None, None]
-    return moved[:, :, :2] / moved[:, :, 2:].clamp_min(0.1) - rays.unsqueeze(1)
+    return moved[:, :, :2] / moved[:, :, 2:].clamp_min(MIN_DEPTH_RATIO) - rays.unsqueeze(1)
 
 
 def _doubled(features: torch.Tensor) -> torch.Tensor:

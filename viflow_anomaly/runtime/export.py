@@ -13,13 +13,13 @@ import torch
 from torch import nn
 
 from viflow_anomaly.checkpoint import load_checkpoint
-from viflow_anomaly.checkpoint_record import write_atomically
+from viflow_anomaly.checkpoint_record import bundled_checkpoint, write_atomically
 from viflow_anomaly.errors import ConfigError
+from viflow_anomaly.model.layers import COARSEST_STRIDE
 from viflow_anomaly.model.outputs import ViflowOutput
 from viflow_anomaly.runtime import exported
 
 OPSET = 20
-SIDE_MULTIPLE_PX = 32
 
 
 class _Tensors(nn.Module):
@@ -71,8 +71,6 @@ def export_onnx(path: Path | None, out: Path | None = None) -> Path:
     }
     del model.metadata_props[:]
     onnx.helper.set_model_props(model, metadata)
-    from viflow_anomaly.checkpoint_record import bundled_checkpoint  # noqa: PLC0415
-
     out = out or (path or bundled_checkpoint()).with_suffix(".onnx")
     write_atomically(out, model.SerializeToString(deterministic=True))
     return out
@@ -87,7 +85,7 @@ def _traced(network: nn.Module, inputs: tuple[torch.Tensor, ...], *, fixed: bool
     shapes: Any = None
     if not fixed:
         height, width = torch.export.Dim("rows", min=1, max=256), torch.export.Dim("columns", min=1, max=256)
-        shapes = ({2: SIDE_MULTIPLE_PX * height, 3: SIDE_MULTIPLE_PX * width}, {}, {})
+        shapes = ({2: COARSEST_STRIDE * height, 3: COARSEST_STRIDE * width}, {}, {})
     scene = network(*inputs).scene is not None
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()), torch.no_grad():
         warnings.simplefilter("ignore")  # the exporter's own deprecations; what it makes is compared in the tests

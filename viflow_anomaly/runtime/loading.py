@@ -24,17 +24,16 @@ def load_runtime(
 ) -> LoadedRuntime:
     """Load a checkpoint (None: the bundled model).
 
-    "auto" takes OpenVINO on a CPU where it is installed and the checkpoint has been exported (``NAME.onnx`` beside it,
-    made from the same weights), else torch.
+    "auto" takes OpenVINO on a CPU where it is installed and ``NAME.onnx`` lies beside the checkpoint, else torch.
 
     Args:
         path: a ``.safetensors`` file with its ``.json`` beside it.
         runtime: which backend.
         device: torch device name.
-        threads: CPU threads of one prediction; None leaves the backend's own.
+        threads: CPU threads of one prediction; None: torch's own number, one in OpenVINO.
 
     Raises:
-        CheckpointError: as ``load_checkpoint``; ``checkpoint_corrupt`` for an export that was made from other weights.
+        CheckpointError: as ``load_checkpoint``; ``export_stale`` for an export of other weights than the checkpoint's.
         ConfigError: ``device_unavailable``; ``runtime_unavailable`` for "openvino" that is not installed, has nothing
             exported to run, or was asked for with another device than the CPU.
     """

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
+import json
 import threading
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -11,13 +12,29 @@ import numpy as np
 import openvino
 
 from viflow_anomaly.checkpoint_record import CheckpointRecord, corrupt_checkpoint, read_checkpoint_file
+from viflow_anomaly.errors import CheckpointError
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.model_input import ModelInput
-from viflow_anomaly.runtime.exported import FLOW_STRIDE_KEY, WEIGHTS_KEY, exported_metadata
+from viflow_anomaly.runtime.exported import FLOW_STRIDE_KEY, METADATA_KEYS, MODEL_KEY, WEIGHTS_KEY, exported_metadata
 from viflow_anomaly.runtime.interface import Hypotheses, Scene
 
 MAX_SIZES = 8
 """Compiled networks kept; one takes a few megabytes and some 100 ms to make."""
+
+
+def _require_fresh(path: Path, metadata: Mapping[str, str], record: CheckpointRecord) -> None:
+    """An export must be of the very weights and configuration that its checkpoint holds now."""
+    if set(METADATA_KEYS) - set(metadata):
+        raise corrupt_checkpoint(path, f"expected an export of this package with {', '.join(METADATA_KEYS)} in it")
+    same_model = json.loads(metadata[MODEL_KEY]) == record.model.model_dump(mode="json")
+    if metadata[WEIGHTS_KEY] != record.sha256 or not same_model:
+        raise CheckpointError(
+            f"{path}: expected an export of the weights {record.sha256[:12]} and their configuration, found one of "
+            f"{metadata[WEIGHTS_KEY][:12]}: the checkpoint was replaced after its export; make it anew with "
+            f"viflow-anomaly export --checkpoint {path.with_suffix('.safetensors')}",
+            code="export_stale",
+            field="checkpoint",
+        )
 
 
 class _Request(NamedTuple):
@@ -47,7 +64,7 @@ class OpenvinoRuntime:
         threads: of one prediction.
 
     Raises:
-        CheckpointError: ``checkpoint_corrupt``.
+        CheckpointError: ``checkpoint_corrupt``; ``export_stale``, the checkpoint was replaced after its export.
     """
 
     name = "openvino"
@@ -61,9 +78,7 @@ class OpenvinoRuntime:
             metadata = exported_metadata(model)
         except RuntimeError as err:
             raise corrupt_checkpoint(path, f"expected an ONNX network, found: {str(err).strip()[-200:]}") from err
-        if metadata.get(WEIGHTS_KEY) != record.sha256:
-            found = metadata.get(WEIGHTS_KEY) or f"none (file sha256 {hashlib.sha256(data).hexdigest()[:12]})"
-            raise corrupt_checkpoint(path, f"expected an export of the weights {record.sha256}, found {found}")
+        _require_fresh(path, metadata, record)
         self._data = data
         self._stride = int(metadata[FLOW_STRIDE_KEY])
         self._compiled: dict[tuple[int, int], Any] = {}
