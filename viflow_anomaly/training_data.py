@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,8 @@ from viflow_anomaly.motion_input import MotionWindow, build_motion_window
 from viflow_anomaly.sensor_data import Frame, FramePair, Uint8Array
 from viflow_anomaly.view import make_view
 
+FRAMES_HELD = 8
+"""More than the longest look-ahead: a frame is read once, and again only where pairs lie far apart."""
 MIRRORED_MOTION_SIGNS = (1, -1, -1, -1, 1, 1)
 """Left and right exchanged: angular rate is an axial vector (y and z change sign), specific force a polar one (x)."""
 
@@ -150,11 +153,12 @@ def _add_recording(
     if camera is not None:  # one that cannot be used would exclude every pair: said at once instead
         make_view(config.view, width=camera.width, height=camera.height, camera=camera)
     in_camera_axes = config.motion_window.axes == "camera" and camera is not None and camera.T_cam_imu is not None
-    frames = [_read(recording, index) for index in range(len(recording))]
+    # A few at a time: whole recordings at the source images' size would not fit into memory.
+    read = lru_cache(maxsize=FRAMES_HELD)(partial(_read, recording))
     places: dict[int, int] = {}  # of the frames of usable pairs in their bucket
     for index, indices in enumerate(pairs.indices):
         try:
-            source, target = (_require(frames[one]) for one in indices)
+            source, target = (_require(read(one)) for one in indices)
             pair = FramePair(source, target, pairs.imu(index), camera)
             window = _require_judgeable(build_motion_window(pair, config.motion_window))
             height, width = source.image.shape
