@@ -27,8 +27,8 @@ RegionLabel = Literal["independent_motion", "model_error"]
 
 MAD_TO_SIGMA = 1.4826
 """Median absolute deviation of a normal distribution -> its standard deviation."""
-STATISTICS_SAMPLES = 5_000
-"""Enough for the median to two hundredths of a sigma; more only costs time."""
+STATISTICS_SAMPLES = 2_500
+"""Enough for the median to three hundredths of a sigma; more only costs time."""
 
 
 class BoundingBox(NamedTuple):
@@ -170,7 +170,7 @@ def _largest_components(mask: BoolArray, closing_px: int, config: RegionConfig) 
     Only the pixels of the mask are looked at, and no component before its area is known: a noisy mask of thousands of
     specks costs little more than a clean one.
     """
-    y, x = np.nonzero(mask)
+    y, x = np.divmod(np.flatnonzero(mask), mask.shape[1])  # np.nonzero takes five times as long
     labels = _component_labels(y, x, mask.shape, pitch_px=(closing_px + 1) // 2)
     areas_px = np.bincount(labels, minlength=1)
     largest_first = np.argsort(-areas_px, kind="stable")[: config.max_regions]
