@@ -16,7 +16,7 @@ from viflow_anomaly.config import FrozenConfig, ModelConfig
 from viflow_anomaly.errors import CheckpointError, ConfigError
 
 FORMAT_VERSION = 1
-BUNDLED_NAME = "viflow-compact"
+BUNDLED_NAME = "viflow-calibrated"
 MAX_RECORD_BYTES = 4 * 1024 * 1024
 
 
