@@ -30,13 +30,18 @@ def test_the_tables_undo_each_other(camera: PinholeCamera, most_px: float) -> No
     np.testing.assert_allclose(back[inside], pixel_grid(256, 320)[inside], atol=most_px)
 
 
+@pytest.mark.parametrize("stride", [1, 4])
 @pytest.mark.parametrize("camera", [EUROC, FISHEYE], ids=["radtan", "equidistant"])
-def test_a_flow_of_one_view_pixel_ends_on_the_next_one(camera: PinholeCamera) -> None:
+def test_a_flow_of_one_view_pixel_ends_on_the_next_one(camera: PinholeCamera, stride: int) -> None:
     maps = maps_of(camera)
-    flow = np.zeros((256, 320, 2), dtype=np.float32)
+    flow = np.zeros((256 // stride, 320 // stride, 2), dtype=np.float32)
     flow[..., 0] = 1.0
-    moved = maps.source_of_view[:, :-1] + maps.distorted_flow(flow, 1)[:, :-1]
-    np.testing.assert_allclose(moved, maps.source_of_view[:, 1:], atol=1e-3)
+    spread = maps.spread(flow, stride)
+    assert spread.shape == (camera.height, camera.width, 2)
+    at = maps.source_of_view[40:-40, 40:-41]
+    moved = at + sample_bilinear(spread, np.ascontiguousarray(at))
+    np.testing.assert_allclose(moved, maps.source_of_view[40:-40, 41:-40], atol=0.02)
+    np.testing.assert_array_equal(maps.spread(flow, stride), spread)
 
 
 def test_the_lattice_reaches_beyond_the_last_pixel() -> None:

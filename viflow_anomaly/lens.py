@@ -7,7 +7,8 @@ a distortion that folds the image, so that two of its pixels show the same ray, 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +21,20 @@ LENS_LATTICE_PX = 8
 of a fisheye's view (60 degrees off its axis) below 0.4 px."""
 MAX_ROUND_TRIP_PX = 1.0
 """A lens is understood where undoing and redoing its distortion comes back this close."""
+
+
+class _CellMaps(NamedTuple):
+    """What a flow on cells of one stride needs, the same for every frame.
+
+    Attributes:
+        cells_of_source: [H, W, 2] flow cell of every source pixel.
+        from_middle: [h, w, 2] view pixels of each cell from the view's middle.
+        source: [h, w, 2] source pixel of each cell.
+    """
+
+    cells_of_source: Float32Array
+    from_middle: Float32Array
+    source: Float32Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,17 +52,36 @@ class LensMaps:
     step_px: tuple[float, float]
     source_of_view: Float32Array
     view_of_source: Float32Array
+    _by_stride: dict[int, _CellMaps] = field(default_factory=dict, repr=False)
 
-    def distorted_flow(self, flow_view_px: Float32Array, stride: int) -> Float32Array:
-        """Flow of the ideal view [h', w', 2] -> flow in distorted source pixels at the same cells."""
-        height, width = flow_view_px.shape[:2]
-        offset = (pixel_grid(height, width) + np.float32(0.5)) * np.float32(stride) - np.float32(0.5)
-        view_height, view_width = self.source_of_view.shape[:2]
-        from_middle = (offset - _middle_px(view_width, view_height).astype(np.float32)).astype(np.float32)
-        to_ray = np.array(self.step_px, dtype=np.float32) / np.array((self.camera.fx, self.camera.fy), dtype=np.float32)
-        source = project_rays(self.camera, (from_middle * to_ray).astype(np.float32))
-        target = project_rays(self.camera, ((from_middle + flow_view_px) * to_ray).astype(np.float32))
-        return np.asarray(target - source, dtype=np.float32)
+    @property
+    def held_bytes(self) -> int:
+        """Of all tables, those that a first flow will add included."""
+        return self.source_of_view.nbytes + 2 * self.view_of_source.nbytes
+
+    def spread(self, flow_view_px: Float32Array, stride: int) -> Float32Array:
+        """Flow of the ideal view on cells [h', w', 2] -> flow of every distorted source pixel [H, W, 2]."""
+        maps = self._cell_maps(flow_view_px.shape[:2], stride)
+        target = project_rays(self.camera, (maps.from_middle + flow_view_px) * self._to_ray())
+        flow = np.asarray(target - maps.source, dtype=np.float32)
+        return np.asarray(sample_bilinear(flow, maps.cells_of_source), dtype=np.float32)
+
+    def _cell_maps(self, shape: tuple[int, ...], stride: int) -> _CellMaps:
+        """Made once; two threads that make the same maps make the same values."""
+        maps = self._by_stride.get(stride)
+        if maps is None:
+            half = np.float32(0.5)
+            offset = (pixel_grid(shape[0], shape[1]) + half) * np.float32(stride) - half
+            view_height, view_width = self.source_of_view.shape[:2]
+            from_middle = (offset - _middle_px(view_width, view_height)).astype(np.float32)
+            source = project_rays(self.camera, from_middle * self._to_ray()).astype(np.float32)
+            cells = (self.view_of_source + half) / np.float32(stride) - half
+            self._by_stride.clear()  # a network has one stride
+            maps = self._by_stride[stride] = _CellMaps(cells, from_middle, source)
+        return maps
+
+    def _to_ray(self) -> Float32Array:
+        return np.array((self.step_px[0] / self.camera.fx, self.step_px[1] / self.camera.fy), dtype=np.float32)
 
 
 def lattice_rays(camera: PinholeCamera) -> Float64Array:

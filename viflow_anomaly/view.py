@@ -95,8 +95,7 @@ class InternalView:
             [H, W, 2] float32 (u, v).
         """
         if self.lens is not None:
-            cells = (self.lens.view_of_source + np.float32(0.5)) / np.float32(stride) - np.float32(0.5)
-            spread = sample_bilinear(self.lens.distorted_flow(flow_view_px, stride), cells)
+            spread = self.lens.spread(flow_view_px, stride)
         else:
             scales = [1 / (step * stride) for step in self.step_px]
             offsets = [
@@ -112,8 +111,7 @@ class InternalView:
         """Bytes of the arrays that the view holds, or will hold once ``analyzed`` was asked."""
         if self.lens is None:
             return 0
-        maps = self.lens.source_of_view.nbytes + self.lens.view_of_source.nbytes
-        return maps + self.source_width * self.source_height
+        return self.lens.held_bytes + self.source_width * self.source_height
 
     def analyzed(self) -> NDArray[np.bool_] | None:
         """[H, W]: source pixels that the view shows, or None when it shows all of them."""
