@@ -40,7 +40,7 @@ def test_a_flow_of_one_view_pixel_ends_on_the_next_one(camera: PinholeCamera, st
     assert spread.shape == (camera.height, camera.width, 2)
     at = maps.source_of_view[40:-40, 40:-41]
     moved = at + sample_bilinear(spread, np.ascontiguousarray(at))
-    np.testing.assert_allclose(moved, maps.source_of_view[40:-40, 41:-40], atol=0.02)
+    np.testing.assert_allclose(moved, maps.source_of_view[40:-40, 41:-40], atol=0.03)
     np.testing.assert_array_equal(maps.spread(flow, stride), spread)
 
 
