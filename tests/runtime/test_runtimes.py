@@ -20,6 +20,7 @@ from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import CheckpointError, ConfigError
 from viflow_anomaly.model.builder import build_model
 from viflow_anomaly.model_input import ModelInput, prepare
+from viflow_anomaly.runtime import export as export_module
 from viflow_anomaly.runtime import loading
 from viflow_anomaly.runtime.export import export_onnx
 from viflow_anomaly.runtime.loading import load_runtime
@@ -184,6 +185,17 @@ def test_more_sizes_than_are_kept_work(exported: dict[str, Path]) -> None:
 def test_the_same_checkpoint_gives_the_same_export(exported: dict[str, Path], tmp_path: Path) -> None:
     again = export_onnx(exported["calibrated"], tmp_path / "again.onnx")
     assert again.read_bytes() == exported["calibrated"].with_suffix(".onnx").read_bytes()
+
+
+def test_an_export_says_nothing_of_the_machine(exported: dict[str, Path]) -> None:
+    content = exported["calibrated"].with_suffix(".onnx").read_bytes()
+    for secret in (b".py", b"stack_trace", str(Path(export_module.__file__).parent).encode()):
+        assert secret not in content
+
+
+def test_export_speaks_only_of_errors(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    export_onnx(save(tmp_path, "compact"))
+    assert capfd.readouterr() == ("", "")
 
 
 def test_the_paper_preset_is_exported_at_its_own_size(tmp_path: Path) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import io
+import logging
 import tempfile
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -69,11 +71,33 @@ def export_onnx(path: Path | None, out: Path | None = None) -> Path:
         exported.MODEL_KEY: record.model.model_dump_json(),
         exported.FLOW_STRIDE_KEY: str(stride),
     }
-    del model.metadata_props[:]
+    _forget_the_machine(model)
     onnx.helper.set_model_props(model, metadata)
     out = out or (path or bundled_checkpoint()).with_suffix(".onnx")
     write_atomically(out, model.SerializeToString(deterministic=True))
     return out
+
+
+def _forget_the_machine(model: Any) -> None:
+    """The exporter notes for every node which lines of which files on this machine it came from."""
+    graph = model.graph
+    for part in (model, graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
+        del part.metadata_props[:]
+        part.doc_string = ""
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """The exporter speaks of its own deprecations and of packages that nobody needs; errors still come through."""
+    exporter = logging.getLogger("torch.onnx")
+    level = exporter.level
+    exporter.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        exporter.setLevel(level)
 
 
 def _example(rows: int, view: Any) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -87,8 +111,7 @@ def _traced(network: nn.Module, inputs: tuple[torch.Tensor, ...], *, fixed: bool
         height, width = torch.export.Dim("rows", min=1, max=256), torch.export.Dim("columns", min=1, max=256)
         shapes = ({2: COARSEST_STRIDE * height, 3: COARSEST_STRIDE * width}, {}, {})
     scene = network(*inputs).scene is not None
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()), torch.no_grad():
-        warnings.simplefilter("ignore")  # the exporter's own deprecations; what it makes is compared in the tests
+    with _quiet(), torch.no_grad():
         return torch.onnx.export(
             _Tensors(network).eval(),
             inputs,
