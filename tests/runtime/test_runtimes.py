@@ -30,6 +30,7 @@ pytest.importorskip("openvino", reason="the extra 'openvino' is not installed")
 pytest.importorskip("onnxscript", reason="the extra 'export' is not installed")
 
 MAX_FLOW_DIFFERENCE_PX = 1e-3
+RUNTIMES: tuple[RuntimeName, ...] = ("torch", "openvino")
 PRESETS: list[Literal["compact", "calibrated"]] = ["compact", "calibrated"]
 
 
@@ -77,10 +78,24 @@ def test_openvino_gives_torchs_flow(exported: dict[str, Path], preset: str, heig
             np.testing.assert_allclose(ours, theirs, atol=1e-4)
 
 
+@pytest.mark.parametrize("rate_rad_s", [0.0, 1e-9, 1e-6, 1e-4, 1e-2, 1.0, 30.0])
+@pytest.mark.parametrize("preset", PRESETS)
+def test_any_turn_is_the_same_and_standing_still_is_a_number(
+    exported: dict[str, Path], preset: str, rate_rad_s: float
+) -> None:
+    one = model_input(64, 96)
+    values = one.window.values * np.float32(0)
+    values[:, 1] = rate_rad_s
+    values[:, 5] = 9.81
+    turning = replace(one, window=replace(one.window, values=values))
+    flows = [load_runtime(exported[preset], runtime=name).runtime.predict(turning).flow_px for name in RUNTIMES]
+    assert np.isfinite(flows[0]).all()
+    np.testing.assert_allclose(flows[1], flows[0], rtol=1e-4, atol=MAX_FLOW_DIFFERENCE_PX)
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_detections_are_the_same(exported: dict[str, Path], preset: str) -> None:
-    runtimes: tuple[RuntimeName, ...] = ("torch", "openvino")
-    detectors = [AnomalyDetector.from_checkpoint(exported[preset], runtime=name) for name in runtimes]
+    detectors = [AnomalyDetector.from_checkpoint(exported[preset], runtime=name) for name in RUNTIMES]
     first, second = (detector.detect(frame_pair()) for detector in detectors)
     assert [roi.bbox for roi in first.rois] == [roi.bbox for roi in second.rois]
     assert [roi.label for roi in first.rois] == [roi.label for roi in second.rois]

@@ -148,12 +148,13 @@ def rotation_matrix(theta: torch.Tensor) -> torch.Tensor:
     x, y, z = theta.unbind(dim=1)
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).reshape(-1, 3, 3)
-    angle2 = theta.square().sum(dim=1)[:, None, None] + 1e-12
-    angle = angle2.sqrt()
+    # At least 1e-4 rad, where both quotients have long reached their limits: 1 - cos is below float32's resolution
+    # there, and OpenVINO's sine over an angle of 1e-6 rad is not a number.
+    half = theta.square().sum(dim=1)[:, None, None].clamp_min(1e-8).sqrt() / 2
+    sinc_half = torch.sin(half) / half
+    sinc = sinc_half * torch.cos(half)
     identity = torch.eye(3, device=theta.device, dtype=theta.dtype)
-    turned: torch.Tensor = (
-        identity + torch.sin(angle) / angle * cross + (1 - torch.cos(angle)) / angle2 * (cross @ cross)
-    )
+    turned: torch.Tensor = identity + sinc * cross + 0.5 * sinc_half.square() * (cross @ cross)
     return turned
 
 
