@@ -10,7 +10,7 @@ from typing import Any, Literal
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
 from pydantic_settings import BaseSettings, SettingsConfigDict, SettingsError
 
-from viflow_anomaly.config import DetectorConfig, ImageLimits, RuntimeName, describe_validation
+from viflow_anomaly.config import MAX_THREADS, DetectorConfig, ImageLimits, RuntimeName, describe_validation
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.settings import refuse_unknown_variables
 
@@ -41,7 +41,7 @@ class ServiceSettings(BaseSettings):
     max_image_pixels: PositiveInt = 16 * MEBIBYTE
     max_body_bytes: PositiveInt = 48 * MEBIBYTE
     max_imu_samples: PositiveInt = 20_000
-    threads: PositiveInt = Field(default=1, description="threads of one detection")
+    threads: int = Field(default=1, ge=1, le=MAX_THREADS, description="threads of one detection")
     max_concurrent: PositiveInt = Field(default_factory=_usable_cores, description="detections running at once")
     max_queued: NonNegativeInt = Field(default=32, description="requests that may wait or upload beside them")
     queue_timeout_s: PositiveFloat = Field(default=10.0, description="longest wait for a turn")

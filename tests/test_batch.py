@@ -7,9 +7,9 @@ import pytest
 import torch
 from worlds import World, make_world
 
-from viflow_anomaly.batch import collate, collate_arrays
+from viflow_anomaly.batch import collate, collate_arrays, require_device
 from viflow_anomaly.config import ModelConfig, ViewConfig
-from viflow_anomaly.errors import InvalidInputError
+from viflow_anomaly.errors import ConfigError, InvalidInputError
 from viflow_anomaly.model_input import prepare
 from viflow_anomaly.motion_input import build_motion_window
 from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples
@@ -67,3 +67,9 @@ def test_an_image_that_the_view_cannot_take_is_refused() -> None:
     with pytest.raises(InvalidInputError) as caught:
         prepare(pair_of(make_world(), 0, 1), config)
     assert caught.value.code == "image_smaller_than_crop"
+
+
+def test_a_device_without_memory_is_refused() -> None:
+    with pytest.raises(ConfigError) as caught:
+        require_device("meta")
+    assert caught.value.code == "device_unavailable"

@@ -284,3 +284,11 @@ def test_without_git_there_is_no_commit(monkeypatch: pytest.MonkeyPatch, failure
 
     monkeypatch.setattr(subprocess, "run", fail)
     assert source_commit() is None
+
+
+def test_nothing_but_a_file_is_written_over(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OSError, match="expected a file or nothing there"):
+        write_atomically(tmp_path / "folder", b"x")
+    with pytest.raises(OSError, match="expected a file or nothing there"):
+        write_atomically(Path("/dev/null"), b"x")

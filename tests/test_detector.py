@@ -250,6 +250,16 @@ def test_a_crop_is_corrected_at_the_cameras_focal_length(tmp_path: Path) -> None
     assert analysis.detection.residual.median < 2.0
 
 
+def test_numbers_that_are_none_are_named_as_such(tmp_path: Path) -> None:
+    network = build_model(COMPACT)
+    assert isinstance(network, CompactViflow)
+    with torch.no_grad():
+        network.local_head.weight.fill_(float("nan"))
+    path = save_checkpoint(tmp_path / "damaged.safetensors", network, COMPACT, name="damaged", version="0")
+    detection = AnomalyDetector.from_checkpoint(path).detect(pair(texture(2), texture(2)))
+    assert (detection.status, [one.code for one in detection.reasons]) == ("abstained", ["prediction_not_finite"])
+
+
 def test_a_gyro_only_sensor_is_told_what_is_missing(detector: AnomalyDetector) -> None:
     still = texture(14)
     samples = imu()

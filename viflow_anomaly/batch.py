@@ -39,8 +39,12 @@ def require_device(device: str) -> None:
         ConfigError: ``device_unavailable``.
     """
     try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as err:  # a torch without CUDA asserts
+        torch.zeros(1, device=device).cpu()
+    except (
+        RuntimeError,
+        AssertionError,
+        NotImplementedError,
+    ) as err:  # a torch without CUDA asserts, "meta" has no data
         raise ConfigError(
             f"device: expected one that this machine has, found {device!r}: {str(err).splitlines()[0]}",
             code="device_unavailable",

@@ -22,6 +22,7 @@ from viflow_anomaly.checkpoint_record import (
     read_checkpoint,
     read_checkpoint_file,
     write_atomically,
+    write_record,
 )
 from viflow_anomaly.config import ModelConfig
 from viflow_anomaly.errors import ConfigError
@@ -56,7 +57,7 @@ def save_checkpoint(
     )
     path.with_suffix(".onnx").unlink(missing_ok=True)  # an export of what was here before
     write_atomically(path, data)
-    write_atomically(path.with_suffix(".json"), (record.model_dump_json(indent=2) + "\n").encode())
+    write_record(path, record)
     return path
 
 
@@ -105,8 +106,8 @@ def load_training_state(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str
     try:
         tensors = load_tensors(data)
         header_bytes = int.from_bytes(data[:8], "little")
-        record: dict[str, Any] = json.loads(json.loads(data[8 : 8 + header_bytes])["__metadata__"]["record"])
-    except (SafetensorError, ValueError, KeyError) as err:
+        record: dict[str, Any] = dict(json.loads(json.loads(data[8 : 8 + header_bytes])["__metadata__"]["record"]))
+    except (SafetensorError, ValueError, KeyError, TypeError) as err:
         raise corrupt_checkpoint(
             path, f"expected tensors and the record of a training, found: {_one_line(err)}"
         ) from err

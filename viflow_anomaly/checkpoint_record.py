@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -28,6 +29,7 @@ class CheckpointRecord(FrozenConfig):
         name, version: of the model.
         sha256: of the tensor file.
         model: what the builder needs.
+        onnx_sha256: of the export beside it, None until there is one.
         provenance: commit, training configuration, data, metrics; free-form, for people.
     """
 
@@ -36,6 +38,7 @@ class CheckpointRecord(FrozenConfig):
     version: str = Field(min_length=1)
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
     model: ModelConfig
+    onnx_sha256: str | None = Field(default=None, pattern="^[0-9a-f]{64}$")
     provenance: dict[str, Any] = Field(default_factory=dict)
 
 
@@ -46,6 +49,8 @@ def bundled_checkpoint() -> Path:
 
 def write_atomically(path: Path, data: bytes) -> None:
     """Write beside ``path`` and rename, so that nobody ever sees half a file."""
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "expected a file or nothing there, found a directory or a device", str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -53,6 +58,11 @@ def write_atomically(path: Path, data: bytes) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_record(path: Path, record: CheckpointRecord) -> None:
+    """Write the JSON of the checkpoint ``path`` (its tensor file)."""
+    write_atomically(path.with_suffix(".json"), (record.model_dump_json(indent=2) + "\n").encode())
 
 
 def read_checkpoint(path: Path) -> tuple[bytes, CheckpointRecord]:

@@ -144,6 +144,7 @@ class RegionConfig(FrozenConfig):
         return self
 
 
+MAX_THREADS = 1024
 RuntimeName = Literal["auto", "torch", "openvino"]
 """What runs the network: "auto" is OpenVINO on a CPU where it is installed and the checkpoint was exported."""
 
@@ -200,7 +201,7 @@ class TrainingConfig(FrozenConfig):
     seed: int = 0
     validate_every: PositiveInt = 1000
     checkpoint_every: PositiveInt = 500
-    threads: PositiveInt = 1
+    threads: int = Field(default=1, ge=1, le=MAX_THREADS)
     relighting: float = Field(default=0.6, ge=0, le=1, description="change of exposure, contrast and noise shown")
     autocast: bool = Field(default=False, description="bfloat16 in the network; on CUDA and recent CPUs")
     validation_pairs: PositiveInt = Field(default=64, description="measured at every validation, evenly spread")

@@ -40,6 +40,12 @@ NOTHING_IN_COMMON = Reason(
 )
 
 
+NOT_FINITE = Reason(
+    code="prediction_not_finite",
+    message="expected finite numbers from the network, found others: its weights are damaged, or its input is absurd",
+)
+
+
 class Analysis(NamedTuple):
     """A detection with the maps it was made from, for pictures and further processing.
 
@@ -143,7 +149,8 @@ class AnomalyDetector:
         summary = _summary(residual, inside, self.config.min_overlap, region_width * region_height)
         reasons, abstained = self._judge_input(pair, model_input)
         if summary is None:
-            reasons, abstained = (*reasons, NOTHING_IN_COMMON), True
+            finite = bool(np.isfinite(predicted.flow_px).all())
+            reasons, abstained = (*reasons, NOTHING_IN_COMMON if finite else NOT_FINITE), True
         elif not abstained:
             reasons = (*reasons, *_doubts(predicted.correction, self.config.correction))
         rois: tuple[Roi, ...] = ()

@@ -16,9 +16,17 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, Field, PositiveInt
+from pydantic import BaseModel, Field
 
-from viflow_anomaly.config import DetectorConfig, FrozenConfig, ImageLimits, ModelConfig, RuntimeName, TrainingConfig
+from viflow_anomaly.config import (
+    MAX_THREADS,
+    DetectorConfig,
+    FrozenConfig,
+    ImageLimits,
+    ModelConfig,
+    RuntimeName,
+    TrainingConfig,
+)
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.simulator.config import SimulatorConfig
 
@@ -54,7 +62,7 @@ class Settings(FrozenConfig):
 
     checkpoint: Path | None = None
     device: str = "cpu"
-    threads: PositiveInt = 1
+    threads: int = Field(default=1, ge=1, le=MAX_THREADS)
     runtime: RuntimeName = "auto"
     limits: ImageLimits = ImageLimits()
     detector: DetectorConfig = DetectorConfig()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -30,6 +31,7 @@ pytest.importorskip("openvino", reason="the extra 'openvino' is not installed")
 pytest.importorskip("onnxscript", reason="the extra 'export' is not installed")
 
 MAX_FLOW_DIFFERENCE_PX = 1e-3
+CONFIG_AT_232_PX = ModelConfig(preset="compact", hypotheses=4, view=ViewConfig(focal_px=232.0)).model_dump(mode="json")
 RUNTIMES: tuple[RuntimeName, ...] = ("torch", "openvino")
 PRESETS: list[Literal["compact", "calibrated"]] = ["compact", "calibrated"]
 
@@ -47,6 +49,11 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     for path in paths.values():
         assert export_onnx(path) == path.with_suffix(".onnx")
     return paths
+
+
+def change_record(path: Path, **changes: object) -> None:
+    record = path.with_suffix(".json")
+    record.write_text(json.dumps(json.loads(record.read_text()) | changes))
 
 
 def frame_pair(height: int = 128, width: int = 192) -> FramePair:
@@ -132,16 +139,14 @@ def test_an_export_of_other_weights_is_stale(exported: dict[str, Path], tmp_path
     assert caught.value.code == "export_stale"
 
 
-def test_an_export_of_another_configuration_is_stale(exported: dict[str, Path], tmp_path: Path) -> None:
+def test_an_export_of_another_configuration_is_refused(exported: dict[str, Path], tmp_path: Path) -> None:
     path = tmp_path / "compact.safetensors"
     for suffix in (".safetensors", ".onnx", ".json"):
         path.with_suffix(suffix).write_bytes(exported["compact"].with_suffix(suffix).read_bytes())
-    record = json.loads(path.with_suffix(".json").read_text())
-    record["model"]["view"]["focal_px"] = 232.0
-    path.with_suffix(".json").write_text(json.dumps(record))
-    with pytest.raises(CheckpointError) as caught:
+    change_record(path, model=CONFIG_AT_232_PX)
+    with pytest.raises(CheckpointError, match="expected the model configuration") as caught:
         load_runtime(path)
-    assert caught.value.code == "export_stale"
+    assert caught.value.code == "checkpoint_corrupt"
 
 
 def test_a_new_checkpoint_takes_the_old_export_away(tmp_path: Path) -> None:
@@ -153,32 +158,46 @@ def test_a_new_checkpoint_takes_the_old_export_away(tmp_path: Path) -> None:
 
 
 def test_a_foreign_network_is_refused(exported: dict[str, Path], tmp_path: Path) -> None:
+    """Even where the record names it."""
     onnx = pytest.importorskip("onnx")
     path = save(tmp_path, "compact")
     model = onnx.load(str(exported["compact"].with_suffix(".onnx")))
     del model.metadata_props[:]
-    onnx.save(model, str(path.with_suffix(".onnx")))
-    with pytest.raises(CheckpointError, match="an export of this package") as caught:
-        load_runtime(path)
-    assert caught.value.code == "checkpoint_corrupt"
+    for content in (model.SerializeToString(), b"no network at all"):
+        path.with_suffix(".onnx").write_bytes(content)
+        change_record(path, onnx_sha256=hashlib.sha256(content).hexdigest())
+        with pytest.raises(CheckpointError, match="an ONNX network of this package") as caught:
+            load_runtime(path)
+        assert caught.value.code == "checkpoint_corrupt"
 
 
-@pytest.mark.parametrize("content", [b"", b"no network", b"\x80\x04pickle"])
-def test_a_file_that_is_no_network_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_an_altered_export_is_refused(exported: dict[str, Path], tmp_path: Path) -> None:
+    path = tmp_path / "compact.safetensors"
+    for suffix in (".safetensors", ".onnx", ".json"):
+        path.with_suffix(suffix).write_bytes(exported["compact"].with_suffix(suffix).read_bytes())
+    whole = path.with_suffix(".onnx").read_bytes()
+    for content in (b"", b"no network", b"\x80\x04pickle", whole[: len(whole) // 2], whole[:-1] + b"\x01"):
+        path.with_suffix(".onnx").write_bytes(content)
+        with pytest.raises(CheckpointError, match="altered, or older than the checkpoint") as caught:
+            load_runtime(path)
+        assert caught.value.code == "export_stale"
+
+
+def test_an_export_elsewhere_is_not_named(exported: dict[str, Path], tmp_path: Path) -> None:
     path = save(tmp_path, "compact")
-    path.with_suffix(".onnx").write_bytes(content)
-    with pytest.raises(CheckpointError) as caught:
-        load_runtime(path)
-    assert caught.value.code == "checkpoint_corrupt"
+    before = path.with_suffix(".json").read_bytes()
+    export_onnx(path, tmp_path / "elsewhere" / "other.onnx")
+    assert path.with_suffix(".json").read_bytes() == before
 
 
-def test_a_truncated_export_is_refused(exported: dict[str, Path], tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["m.safetensors", "m.json", "m", ""])
+def test_an_export_never_overwrites_anything_else(tmp_path: Path, name: str) -> None:
     path = save(tmp_path, "compact")
-    whole = exported["compact"].with_suffix(".onnx").read_bytes()
-    path.with_suffix(".onnx").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(CheckpointError) as caught:
-        load_runtime(path)
-    assert caught.value.code == "checkpoint_corrupt"
+    before = path.read_bytes()
+    with pytest.raises(ConfigError) as caught:
+        export_onnx(path, Path(name) if not name else tmp_path / name)
+    assert caught.value.code == "export_name"
+    assert path.read_bytes() == before
 
 
 def test_threads_share_a_runtime_and_get_the_serial_answers(exported: dict[str, Path]) -> None:

@@ -76,8 +76,10 @@ def _print_table(detection: Detection) -> None:
     from rich.markup import escape
     from rich.table import Column, Table
 
-    console = Console()
-    console.print(f"[bold]{detection.status}[/bold], {len(detection.rois)} regions, model {detection.model.name}")
+    console, sha256 = Console(), detection.model.sha256
+    console.print(
+        f"[bold]{detection.status}[/bold], {len(detection.rois)} regions, model {detection.model.name} ({sha256[:8]})"
+    )
     for reason in detection.reasons:
         console.print(f"  {reason.code}: {escape(reason.message)}", highlight=False)
     if not detection.rois:

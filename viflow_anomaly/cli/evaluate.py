@@ -129,7 +129,8 @@ def _print_table(errors: EndpointErrors, record: CheckpointRecord) -> None:
     from rich.table import Column, Table
 
     columns = [
-        Column(name, justify="right") for name in ("pairs", "EPE px", "predicted", "identity", "ratio", "predicted")
+        Column(name, justify="right")
+        for name in ("pairs", "EPE px", "predicted px", "identity px", "ratio", "predicted")
     ]
     table = Table(Column("sequence", no_wrap=True), *columns, box=SIMPLE)
     parts = [errors.per_sequence(), errors.per_group(), {"all": errors}]
@@ -140,7 +141,7 @@ def _print_table(errors: EndpointErrors, record: CheckpointRecord) -> None:
             table.add_row(escape(name), str(len(some.pairs)), *numbers)
         table.add_section()
     console = Console()
-    console.print(f"model {escape(record.name)} {escape(record.version)}", highlight=False)
+    console.print(f"model {escape(record.name)} {escape(record.version)} ({record.sha256[:8]})", highlight=False)
     console.print(table)
 
 
@@ -149,7 +150,7 @@ DETECTION_COLUMNS = {
     "best_f1": "F1",
     "recall_at_0.1_false_alarms": "recall @0.1",
     "recall_at_0.01_false_alarms": "@0.01",
-    "false_alarms_per_frame": "false/frame",
+    "false_alarms_per_frame": "alarms",
     "pixel_ap": "pixel AP",
 }
 

@@ -68,6 +68,8 @@ def run(arguments: Sequence[str]) -> int:
         return _complain(err.format_message() + hint)
     except ViflowError as err:
         return _complain(f"{err.message} [{err.code}]")
+    except RecursionError:
+        return _complain("expected settings and files nested a few levels deep, found hundreds")
     except OSError as err:
         place = f"{err.filename}: " if err.filename is not None else ""
         return _complain(f"{place}{err.strerror or err}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 import logging
 import tempfile
@@ -15,7 +16,7 @@ import torch
 from torch import nn
 
 from viflow_anomaly.checkpoint import load_checkpoint
-from viflow_anomaly.checkpoint_record import bundled_checkpoint, write_atomically
+from viflow_anomaly.checkpoint_record import bundled_checkpoint, write_atomically, write_record
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.model.layers import COARSEST_STRIDE
 from viflow_anomaly.model.outputs import ViflowOutput
@@ -39,13 +40,16 @@ class _Tensors(nn.Module):
 def export_onnx(path: Path | None, out: Path | None = None) -> Path:
     """Write ``NAME.onnx`` for any view size whose sides are multiples of 32; weights in float32.
 
+    Beside its checkpoint, the export's checksum is noted in the checkpoint's record.
+
     Args:
         path: the checkpoint (None: the bundled one).
         out: where to (None: beside the checkpoint, where the detector looks for it).
 
     Raises:
         CheckpointError: as ``load_checkpoint``.
-        ConfigError: ``export_unavailable``: the packages onnx and onnxscript are missing.
+        ConfigError: ``export_unavailable``: the packages onnx and onnxscript are missing; ``export_name``: ``out`` is
+            no .onnx file.
     """
     try:
         import onnx  # noqa: PLC0415  # an extra
@@ -56,7 +60,13 @@ def export_onnx(path: Path | None, out: Path | None = None) -> Path:
             "pip install 'viflow-anomaly[export]'",
             code="export_unavailable",
         ) from err
+    path = bundled_checkpoint() if path is None else path
     network, record = load_checkpoint(path)
+    out = path.with_suffix(".onnx") if out is None else out
+    if out.suffix != ".onnx":
+        raise ConfigError(
+            f"export: expected the name of an .onnx file to write, found {str(out)!r}", code="export_name", field="out"
+        )
     source, motion, interval_s = _example(record.model.motion_window.rows, record.model.view)
     stride = network(source, motion, interval_s).stride
     program = _traced(network, (source, motion, interval_s), fixed=record.model.preset == "paper")
@@ -73,8 +83,11 @@ def export_onnx(path: Path | None, out: Path | None = None) -> Path:
     }
     _forget_the_machine(model)
     onnx.helper.set_model_props(model, metadata)
-    out = out or (path or bundled_checkpoint()).with_suffix(".onnx")
-    write_atomically(out, model.SerializeToString(deterministic=True))
+    data = model.SerializeToString(deterministic=True)
+    write_atomically(out, data)
+    if out == path.with_suffix(".onnx"):
+        named = record.model_copy(update={"onnx_sha256": hashlib.sha256(data).hexdigest()})
+        write_record(path, named)
     return out
 
 

@@ -9,7 +9,6 @@ VERSION_KEY = "viflow.version"
 WEIGHTS_KEY = "viflow.weights_sha256"
 MODEL_KEY = "viflow.model"
 FLOW_STRIDE_KEY = "viflow.flow_stride"
-METADATA_KEYS = (NAME_KEY, VERSION_KEY, WEIGHTS_KEY, MODEL_KEY, FLOW_STRIDE_KEY)
 INPUT_NAMES = ("source", "motion", "interval_s")
 FLOW_OUTPUTS = ("flow_px",)
 SCENE_OUTPUTS = ("flow_px", "inverse_depth", "rotation", "translation")

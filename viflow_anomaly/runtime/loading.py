@@ -38,6 +38,8 @@ def load_runtime(
             exported to run, or was asked for with another device than the CPU.
     """
     path = bundled_checkpoint() if path is None else path
+    if path.suffix != ".safetensors":
+        read_checkpoint(path)  # says what is wrong with the name
     exported = path.with_suffix(".onnx")
     missing = _what_openvino_lacks(exported, device)
     if runtime == "openvino" and missing:

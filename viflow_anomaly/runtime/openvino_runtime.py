@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import threading
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -15,22 +15,20 @@ from viflow_anomaly.checkpoint_record import CheckpointRecord, corrupt_checkpoin
 from viflow_anomaly.errors import CheckpointError
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.model_input import ModelInput
-from viflow_anomaly.runtime.exported import FLOW_STRIDE_KEY, METADATA_KEYS, MODEL_KEY, WEIGHTS_KEY, exported_metadata
+from viflow_anomaly.runtime.exported import FLOW_STRIDE_KEY, MODEL_KEY, exported_metadata
 from viflow_anomaly.runtime.interface import Hypotheses, Scene
 
 MAX_SIZES = 8
 """Compiled networks kept; one takes a few megabytes and some 100 ms to make."""
 
 
-def _require_fresh(path: Path, metadata: Mapping[str, str], record: CheckpointRecord) -> None:
-    """An export must be of the very weights and configuration that its checkpoint holds now."""
-    if set(METADATA_KEYS) - set(metadata):
-        raise corrupt_checkpoint(path, f"expected an export of this package with {', '.join(METADATA_KEYS)} in it")
-    same_model = json.loads(metadata[MODEL_KEY]) == record.model.model_dump(mode="json")
-    if metadata[WEIGHTS_KEY] != record.sha256 or not same_model:
+def _require_fresh(path: Path, data: bytes, record: CheckpointRecord) -> None:
+    """An export must be the very file that was made from its checkpoint as it is now: the record names its checksum."""
+    found = hashlib.sha256(data).hexdigest()
+    if found != record.onnx_sha256:
         raise CheckpointError(
-            f"{path}: expected an export of the weights {record.sha256[:12]} and their configuration, found one of "
-            f"{metadata[WEIGHTS_KEY][:12]}: the checkpoint was replaced after its export; make it anew with "
+            f"{path}: expected the export that {path.with_suffix('.json').name} names, sha256 {record.onnx_sha256}, "
+            f"found {found}: altered, or older than the checkpoint; make it anew with "
             f"viflow-anomaly export --checkpoint {path.with_suffix('.safetensors')}",
             code="export_stale",
             field="checkpoint",
@@ -64,7 +62,7 @@ class OpenvinoRuntime:
         threads: of one prediction.
 
     Raises:
-        CheckpointError: ``checkpoint_corrupt``; ``export_stale``, the checkpoint was replaced after its export.
+        CheckpointError: ``export_stale``: altered, or the checkpoint was replaced after it; ``checkpoint_corrupt``.
     """
 
     name = "openvino"
@@ -72,13 +70,17 @@ class OpenvinoRuntime:
     def __init__(self, path: Path, record: CheckpointRecord, *, threads: int = 1) -> None:
         self._threads = threads
         data = read_checkpoint_file(path)
+        _require_fresh(path, data, record)
         self._core = openvino.Core()
         try:
-            model = self._core.read_model(data)
-            metadata = exported_metadata(model)
-        except RuntimeError as err:
-            raise corrupt_checkpoint(path, f"expected an ONNX network, found: {str(err).strip()[-200:]}") from err
-        _require_fresh(path, metadata, record)
+            metadata = exported_metadata(self._core.read_model(data))
+            same_model = json.loads(metadata[MODEL_KEY]) == record.model.model_dump(mode="json")
+        except (RuntimeError, LookupError, ValueError) as err:
+            raise corrupt_checkpoint(
+                path, f"expected an ONNX network of this package, found: {str(err)[-200:]}"
+            ) from err
+        if not same_model:
+            raise corrupt_checkpoint(path, f"expected the model configuration of {path.with_suffix('.json')} in it")
         self._data = data
         self._stride = int(metadata[FLOW_STRIDE_KEY])
         self._compiled: dict[tuple[int, int], Any] = {}
