@@ -15,8 +15,11 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from viflow_anomaly.checkpoint import load_checkpoint
+from viflow_anomaly.checkpoint_record import BUNDLED_NAME
 from viflow_anomaly.cli.main import run
 from viflow_anomaly.datasets.registry import open_recording
+from viflow_anomaly.runtime.loading import load_runtime
 
 ROOT = Path(__file__).resolve().parents[1]
 # Written in pieces, or this file would find itself.
@@ -161,3 +164,13 @@ def test_the_bundled_sample_is_whole_in_the_repository() -> None:
     images = {recording.frame_path(index).resolve() for index in range(len(recording))}
     assert len(images) == 10
     assert images <= {path.resolve() for path in tracked_files()}
+
+
+def test_the_recipe_replaces_the_model_that_is_loaded() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert f"viflow_anomaly/weights/{BUNDLED_NAME}.$$kind" in makefile
+    weights = ROOT / "viflow_anomaly" / "weights"
+    kinds = {path.suffix for path in weights.iterdir() if path.stem == BUNDLED_NAME}
+    assert kinds == {".safetensors", ".json", ".onnx", ".md"}
+    assert load_checkpoint().record.sha256 in (weights / f"{BUNDLED_NAME}.md").read_text(encoding="utf-8")
+    assert load_runtime(None).record.name == BUNDLED_NAME
