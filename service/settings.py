@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
 from pydantic_settings import BaseSettings, SettingsConfigDict, SettingsError
 
-from viflow_anomaly.config import MAX_THREADS, DetectorConfig, ImageLimits, RuntimeName, describe_validation
+from viflow_anomaly.config import MAX_THREADS, DetectorConfig, ImageLimits, RuntimeName, UsablePath, describe_validation
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.settings import refuse_unknown_variables
 
@@ -31,7 +30,7 @@ class ServiceSettings(BaseSettings):
         env_prefix="VIFLOW_", env_nested_delimiter="__", frozen=True, extra="forbid", allow_inf_nan=False
     )
 
-    checkpoint: Path | None = Field(default=None, description="model to load; the bundled one when not given")
+    checkpoint: UsablePath | None = Field(default=None, description="model to load; the bundled one when not given")
     device: str = "cpu"
     runtime: RuntimeName = Field(default="auto", description="torch, openvino, or auto: OpenVINO where it can run")
     detector: DetectorConfig = DetectorConfig()

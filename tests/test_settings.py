@@ -189,3 +189,10 @@ def test_a_missing_file_and_a_directory_are_refused(tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=f"{name}: expected a readable .*{reason}") as caught:
             read_config_file(tmp_path / name)
         assert caught.value.code == "config_unreadable"
+
+
+@pytest.mark.parametrize("path", ["a\0b.safetensors", "a\ud800b.safetensors"])
+def test_a_text_that_is_no_path_is_refused(path: str) -> None:
+    with pytest.raises(ConfigError, match=r"checkpoint: .*expected a path") as caught:
+        resolve_settings(environment={}, options={"checkpoint": path})
+    assert caught.value.code == "config_invalid"

@@ -6,11 +6,35 @@ image size. The resolved configuration is saved beside every result.
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from pathlib import Path
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    PositiveFloat,
+    PositiveInt,
+    ValidationError,
+    model_validator,
+)
 
 from viflow_anomaly.errors import ConfigError
+
+
+def usable_path(path: Path) -> Path:
+    """A path that the operating system can be asked about; texts with NUL or lone surrogates are none.
+
+    Raises:
+        ValueError: expected a path, found something else.
+    """
+    if "\0" in str(path) or any("\ud800" <= character <= "\udfff" for character in str(path)):
+        raise ValueError(f"expected a path, found {str(path)!r}")
+    return path
+
+
+UsablePath = Annotated[Path, AfterValidator(usable_path)]
 
 
 class FrozenConfig(BaseModel):

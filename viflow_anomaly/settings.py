@@ -26,6 +26,7 @@ from viflow_anomaly.config import (
     ModelConfig,
     RuntimeName,
     TrainingConfig,
+    UsablePath,
 )
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.simulator.config import SimulatorConfig
@@ -60,7 +61,7 @@ class Settings(FrozenConfig):
     because idle OpenMP threads of a wider pool spin and take the cores from each other.
     """
 
-    checkpoint: Path | None = None
+    checkpoint: UsablePath | None = None
     device: str = "cpu"
     threads: int = Field(default=1, ge=1, le=MAX_THREADS)
     runtime: RuntimeName = "auto"
