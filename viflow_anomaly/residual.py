@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viflow_anomaly.errors import TooLargeError
-from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.geometry import Float32Array, sample_bilinear
 from viflow_anomaly.sensor_data import Uint8Array
 
 MAX_SIDE_PX = 32767
@@ -45,9 +45,7 @@ def reconstruct(target: Uint8Array, target_coordinates: Float32Array) -> tuple[F
     low, high = -BOUNDARY_TOLERANCE_PX, BOUNDARY_TOLERANCE_PX
     inside = cv2.inRange(target_coordinates, (low, low), (width - 1 + high, height - 1 + high)) != 0
     # BORDER_REPLICATE: at u = W - 1 bilinear sampling reads the pixel beyond, with weight zero.
-    sampled = cv2.remap(  # type: ignore[call-overload]  # the stubs lack the two-channel map
-        target.astype(np.float32), target_coordinates, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    sampled = sample_bilinear(target.astype(np.float32), target_coordinates)
     np.copyto(sampled, 0.0, where=~inside)  # not a product: a NaN coordinate samples NaN
     return np.asarray(sampled, dtype=np.float32), inside
 
