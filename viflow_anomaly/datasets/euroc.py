@@ -9,6 +9,8 @@ mav0/
   imu0/
     data.csv          #timestamp [ns],w_x,w_y,w_z [rad/s],a_x,a_y,a_z [m/s^2]
     sensor.yaml       T_BS (optional: without it the mounting is unknown)
+  state_groundtruth_estimate0/
+    data.csv          #timestamp,p_RS_R_x,p_RS_R_y,p_RS_R_z [m],q_RS_w,q_RS_x,q_RS_y,q_RS_z,... (optional)
 ```
 
 ``T_BS`` maps sensor coordinates to the body, so ``T_cam_imu = inv(T_BS_cam) @ T_BS_imu``. A ``timeshift_cam_imu`` in
@@ -19,6 +21,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +30,14 @@ import yaml
 
 from viflow_anomaly.config import ImageLimits
 from viflow_anomaly.datasets.recording import FileRecording
-from viflow_anomaly.datasets.tables import read_frame_list, read_stamped_numbers, read_text
+from viflow_anomaly.datasets.tables import csv_malformed, read_frame_list, read_lines, read_stamped_numbers, read_text
+from viflow_anomaly.datasets.trajectory import Trajectory, rigid, rotations_of
 from viflow_anomaly.errors import DatasetError, InvalidInputError
 from viflow_anomaly.imu_log import ImuLog
 from viflow_anomaly.sensor_data import Float64Array, PinholeCamera
 
 NEEDS = "mav0/ (or its content) with imu0/data.csv and cam*/data.csv"
+MIN_QUATERNION_LENGTH = 1e-3
 DISTORTION_NAMES = {
     "radial-tangential": "radtan",
     "radtan": "radtan",
@@ -40,6 +45,9 @@ DISTORTION_NAMES = {
     "none": "none",
 }
 IMU_COLUMNS = ("timestamp", "w_x", "w_y", "w_z", "a_x", "a_y", "a_z")
+POSE_COLUMNS = ("timestamp", "p_x", "p_y", "p_z", "q_w", "q_x", "q_y", "q_z")
+STATE_COLUMNS = (*POSE_COLUMNS, "v_x", "v_y", "v_z", "b_w_x", "b_w_y", "b_w_z", "b_a_x", "b_a_y", "b_a_z")
+"""EuRoC's own states; a trajectory from elsewhere may end with the pose."""
 
 
 def find_root(path: Path) -> Path | None:
@@ -60,7 +68,7 @@ def open_euroc(root: Path, *, camera: str | None, limits: ImageLimits) -> FileRe
 
     Raises:
         DatasetError: ``camera_unknown``, ``csv_malformed``, ``timestamps_not_increasing``, ``image_missing``,
-            ``yaml_malformed``, ``calibration_malformed``.
+            ``yaml_malformed``, ``calibration_malformed``; the trajectory is read when it is asked for.
     """
     chosen = camera or _cameras(root)[0]
     if chosen not in _cameras(root):
@@ -79,6 +87,9 @@ def open_euroc(root: Path, *, camera: str | None, limits: ImageLimits) -> FileRe
         frame_timestamps_ns=stamps,
         frame_paths=tuple(paths),
         limits=limits,
+        read_trajectory=partial(
+            read_trajectory, root / "state_groundtruth_estimate0" / "data.csv", folder / "sensor.yaml"
+        ),
     )
 
 
@@ -123,6 +134,31 @@ def read_camera(cam_yaml: Path, imu_yaml: Path) -> PinholeCamera | None:
         )
     except InvalidInputError as err:
         raise _malformed(cam_yaml, err.message) from err
+
+
+def read_trajectory(states: Path, cam_yaml: Path) -> Trajectory | None:
+    """Poses of the camera from the body's states and the camera's ``T_BS``; None where either file is not there.
+
+    Raises:
+        DatasetError: ``csv_malformed`` (also stamps that do not increase, or a quaternion of length 0),
+            ``yaml_malformed``, ``calibration_malformed``.
+    """
+    if not states.is_file() or not cam_yaml.is_file():
+        return None
+    T_body_cam = _read_T_BS(cam_yaml, _read_yaml(cam_yaml))
+    first = next((line.text for line in read_lines(states) if not line.text.startswith("#")), "")
+    columns = POSE_COLUMNS if first.count(",") == len(POSE_COLUMNS) - 1 else STATE_COLUMNS
+    stamps, values = read_stamped_numbers(states, columns, header="comment")
+    wrong = np.flatnonzero(np.diff(stamps) <= 0) + 1
+    if not wrong.size:
+        wrong = np.flatnonzero(np.linalg.norm(values[:, 3:7], axis=1) < MIN_QUATERNION_LENGTH)
+    if wrong.size:
+        problem = f"expected increasing stamps and quaternions of length 1, found {stamps[wrong[0]]}, "
+        raise csv_malformed(
+            states, int(wrong[0]) + 1, problem + f"{values[wrong[0], 3:7].tolist()} in this row of data"
+        )
+    T_world_body = rigid(rotations_of(values[:, 3:7]), values[:, :3])
+    return Trajectory(stamps, T_world_body @ T_body_cam, str(states))
 
 
 def _mounting(cam_yaml: Path, sensor: Mapping[str, Any], imu_yaml: Path) -> Float64Array | None:

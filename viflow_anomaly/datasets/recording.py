@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from viflow_anomaly.config import ImageLimits
+from viflow_anomaly.datasets.trajectory import Trajectory
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.images import read_image
 from viflow_anomaly.imu_log import ImuLog
@@ -66,6 +69,15 @@ class Recording(Protocol):
         """[M] the platform's command or speed at frame ``index``, or None where the recording has none."""
         ...
 
+    @property
+    def trajectory(self) -> Trajectory | None:
+        """Where the camera was, or None where the recording does not say.
+
+        Raises:
+            DatasetError: of the reader; the file is read when it is asked for.
+        """
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class FileRecording:
@@ -77,6 +89,7 @@ class FileRecording:
         frame_paths: F image files.
         motor_commands: [F, M] or None.
         limits: on every image that is decoded.
+        read_trajectory: reads the poses of the camera when they are first asked for; None: there are none.
 
     Raises:
         DatasetError: ``no_frames``.
@@ -91,6 +104,7 @@ class FileRecording:
     frame_paths: tuple[Path, ...]
     motor_commands: Float64Array | None = None
     limits: ImageLimits = field(default_factory=ImageLimits)
+    read_trajectory: Callable[[], Trajectory | None] | None = None
 
     def __post_init__(self) -> None:
         if not self.frame_paths:
@@ -115,3 +129,7 @@ class FileRecording:
     def motor_command(self, index: int) -> Float64Array | None:
         self.frame_path(index)
         return None if self.motor_commands is None else np.asarray(self.motor_commands[index])
+
+    @cached_property
+    def trajectory(self) -> Trajectory | None:
+        return None if self.read_trajectory is None else self.read_trajectory()
