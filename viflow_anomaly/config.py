@@ -223,6 +223,7 @@ class CorrectionConfig(FrozenConfig):
 
     enabled: bool = True
     rounds: int = Field(default=4, ge=1, le=50)
+    depth_rounds: int = Field(default=2, ge=0, le=50, description="of the depth's refinement; 0: depth as predicted")
     tolerance_px: float = Field(
         default=0.7, ge=0.01, le=100, description="view pixels at which a cell's weight is halved"
     )
