@@ -21,20 +21,31 @@ from viflow_anomaly.sensor_data import Float64Array
 # oxts/dataformat.txt: ax ay az and wx wy wz are along the unit's own axes (front, left, top); af al au and wf wl wu are
 # levelled to the horizon and no IMU would measure them.
 OXTS_COLUMNS = 30
+OXTS_PLACE = slice(0, 6)
 OXTS_FORWARD_SPEED = 8
 OXTS_ACCEL = slice(11, 14)
 OXTS_GYRO = slice(17, 20)
+
+SPEED_NAMES = ("forward_speed_m_s",)
+"""What a KITTI recording's motor command is: OXTS ``vf``."""
 
 STAMP = re.compile(r"(\d{4})-(\d\d)-(\d\d) (\d\d):(\d\d):(\d\d)\.(\d{1,9})", re.ASCII)
 
 
 @dataclass(frozen=True)
 class OxtsRow:
-    """One OXTS record: gyro [3] rad/s, accelerometer [3] m/s^2, both x front, y left, z top; forward speed m/s."""
+    """One OXTS record; the unit's axes are x front, y left, z top.
+
+    Args:
+        gyro_rad_s, accel_m_s2: [3] each.
+        forward_speed_m_s: along the ground.
+        place: [6] latitude and longitude in degrees, altitude in metres; roll, pitch and yaw in radians.
+    """
 
     gyro_rad_s: Float64Array
     accel_m_s2: Float64Array
     forward_speed_m_s: float
+    place: Float64Array
 
 
 def malformed(path: Path, line: int, code: str, problem: str) -> DatasetError:
@@ -103,11 +114,17 @@ def parse_oxts(path: Path, line: int, text: str) -> OxtsRow:
     cells = text.split()
     if len(cells) != OXTS_COLUMNS:
         raise malformed(path, line, "oxts_malformed", f"expected {OXTS_COLUMNS} numbers, found {len(cells)}")
-    values = np.array(_floats(path, line, "oxts_malformed", cells))
-    return OxtsRow(values[OXTS_GYRO], values[OXTS_ACCEL], float(values[OXTS_FORWARD_SPEED]))
+    values = np.array(finite_numbers(path, line, "oxts_malformed", cells))
+    speed = float(values[OXTS_FORWARD_SPEED])
+    return OxtsRow(values[OXTS_GYRO], values[OXTS_ACCEL], speed, values[OXTS_PLACE])
 
 
-def _floats(path: Path, line: int, code: str, cells: list[str]) -> list[float]:
+def finite_numbers(path: Path, line: int, code: str, cells: list[str]) -> list[float]:
+    """Numbers of a line.
+
+    Raises:
+        DatasetError: ``code``: a cell that is no finite number.
+    """
     values = []
     for cell in cells:
         try:
@@ -152,7 +169,7 @@ def read_calibration(
             key, rest = (names[index] if index < len(names) else ""), line.text
         if key not in sizes:
             continue
-        numbers = _floats(path, line.number, "calibration_malformed", rest.split())
+        numbers = finite_numbers(path, line.number, "calibration_malformed", rest.split())
         if len(numbers) != sizes[key]:
             problem = f"{key}: expected {sizes[key]} numbers, found {len(numbers)}"
             raise malformed(path, line.number, "calibration_malformed", problem)
