@@ -16,7 +16,8 @@ from viflow_anomaly.config import ImageLimits
 from viflow_anomaly.datasets.tables import read_lines
 from viflow_anomaly.errors import DatasetError, ViflowError
 from viflow_anomaly.images import read_image_size
-from viflow_anomaly.sensor_data import Float64Array
+from viflow_anomaly.imu_log import ImuLog
+from viflow_anomaly.sensor_data import Float64Array, Int64Array
 
 # oxts/dataformat.txt: ax ay az and wx wy wz are along the unit's own axes (front, left, top); af al au and wf wl wu are
 # levelled to the horizon and no IMU would measure them.
@@ -147,6 +148,46 @@ def read_oxts_file(path: Path) -> OxtsRow:
     if len(lines) != 1:
         raise malformed(path, 1, "oxts_malformed", f"expected one line, found {len(lines)}")
     return parse_oxts(path, lines[0].number, lines[0].text)
+
+
+def read_oxts_folder(folder: Path, span: tuple[int, int] | None = None) -> tuple[Int64Array, list[OxtsRow]]:
+    """``oxts/``: stamps [N], in the order of the records, and the records.
+
+    Args:
+        folder: holds ``timestamps.txt`` and ``data/``.
+        span: (first, last) nanoseconds: only the records from the first to the last that lie inside, so that disorder
+            among them stays; None: all.
+
+    Raises:
+        DatasetError: ``oxts_malformed`` (also without any record), ``timestamps_malformed``, ``timestamps_missing``,
+            ``file_name_malformed``, ``file_missing``, ``text_not_utf8``.
+    """
+    stamps = read_stamps(folder / "timestamps.txt")
+    files = numbered_files(folder / "data", (".txt",))
+    if span is not None:
+        inside = [number for number in files if number in stamps and span[0] <= stamps[number] <= span[1]]
+        files = {number: file for number, file in files.items() if inside and inside[0] <= number <= inside[-1]}
+    if not files:
+        when = "" if span is None else f" between {span[0]} and {span[1]} ns"
+        raise DatasetError(f"{folder / 'data'}: expected at least one record{when}, found none", code="oxts_malformed")
+    numbers = np.array([stamp_of(folder / "timestamps.txt", stamps, number) for number in files], dtype=np.int64)
+    return numbers, [read_oxts_file(file) for file in files.values()]
+
+
+def oxts_imu(imu_stamps: Int64Array, rows: Sequence[OxtsRow]) -> ImuLog:
+    """The records as a raw IMU log, with whatever disorder their stamps have."""
+    return ImuLog(imu_stamps, np.array([row.gyro_rad_s for row in rows]), np.array([row.accel_m_s2 for row in rows]))
+
+
+def forward_speeds(stamps: Int64Array, imu_stamps: Int64Array, rows: Sequence[OxtsRow]) -> Float64Array:
+    """[F, 1] forward speed in m/s of the record closest in time to each frame."""
+    order = np.argsort(imu_stamps, kind="stable")
+    times = imu_stamps[order]
+    right = np.searchsorted(times, stamps).clip(1, max(times.size - 1, 1))
+    left = right - 1
+    right = right.clip(0, times.size - 1)
+    nearest = np.where(stamps - times[left] <= times[right] - stamps, left, right)
+    return np.array([[rows[k].forward_speed_m_s] for k in order[nearest]])
 
 
 def read_calibration(
