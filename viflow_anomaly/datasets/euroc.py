@@ -71,7 +71,8 @@ def open_euroc(root: Path, *, camera: str | None, limits: ImageLimits) -> FileRe
 
     Raises:
         DatasetError: ``camera_unknown``, ``csv_malformed``, ``timestamps_not_increasing``, ``image_missing``,
-            ``yaml_malformed``, ``calibration_malformed``, ``motor_not_covering``; the trajectory is read when it is asked for.
+            ``yaml_malformed``, ``calibration_malformed``, ``motor_not_covering``; the trajectory is read when
+            it is asked for.
     """
     chosen = camera or _cameras(root)[0]
     if chosen not in _cameras(root):

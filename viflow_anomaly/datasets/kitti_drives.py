@@ -12,7 +12,7 @@ raw_data/                                  beside the benchmark's folder or in i
 ```
 
 Frame numbers of the benchmarks are those of the ``_sync`` drives. ``_extract`` drives begin some frames earlier
-(https://github.com/jedeschaud/ct_icp/issues/2), so frames are never looked up there; its OXTS carries stamps of its own.
+(https://github.com/jedeschaud/ct_icp/issues/2), so frames are never looked up there; its OXTS has stamps of its own.
 """
 
 from __future__ import annotations

@@ -160,7 +160,8 @@ def read_oxts_folder(folder: Path, span: tuple[int, int] | None = None) -> tuple
 
     Raises:
         DatasetError: ``oxts_malformed`` (also without any record), ``imu_not_covering`` (none inside ``span``),
-            ``timestamps_malformed``, ``timestamps_missing``, ``file_name_malformed``, ``file_missing``, ``text_not_utf8``.
+            ``timestamps_malformed``, ``timestamps_missing``, ``file_name_malformed``, ``file_missing``,
+            ``text_not_utf8``.
     """
     stamps = read_stamps(folder / "timestamps.txt")
     files = numbered_files(folder / "data", (".txt",))

@@ -52,7 +52,7 @@ MAX_DISAGREEMENT_NS = 50_000_000
 
 
 def find_root(path: Path) -> Path | None:
-    """``path`` itself when it is a sequence of the benchmark, else None; one with an IMU file is ``kitti_odometry``'s."""
+    """``path`` itself when it is a sequence of the benchmark, else None. With an IMU file it is ``kitti_odometry``'s."""
     numbered = re.fullmatch(r"[01][0-9]|2[01]", path.resolve().name) is not None
     return path if numbered and (path / "times.txt").is_file() and _cameras(path) else None
 
@@ -134,9 +134,10 @@ def _stamps(times_file: Path, drive: RawDrive, frames: DriveFrames, camera: str)
     for number, stamp in stamps.items():
         recorded = stamp_of(path, raw, frames.first + number)
         if abs(recorded - stamp) > MAX_DISAGREEMENT_NS:
+            after_s = (recorded - start) * 1e-9
             raise DatasetError(
                 f"{times_file}, line {number + 1}: expected the time of frame {frames.first + number} of "
-                f"{frames.drive}, {(recorded - start) * 1e-9:.3f} s after the first, found {times[number] * 1e-9:.3f} s",
+                f"{frames.drive}, {after_s:.3f} s after the first, found {times[number] * 1e-9:.3f} s",
                 code="kitti_raw_mismatch",
             )
     return stamps
