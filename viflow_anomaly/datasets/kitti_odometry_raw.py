@@ -52,7 +52,7 @@ MAX_DISAGREEMENT_NS = 50_000_000
 
 
 def find_root(path: Path) -> Path | None:
-    """``path`` itself when it is a sequence of the benchmark, else None. With an IMU file it is ``kitti_odometry``'s."""
+    """``path`` itself when it is a sequence of the benchmark, else None (with an IMU file: ``kitti_odometry``)."""
     numbered = re.fullmatch(r"[01][0-9]|2[01]", path.resolve().name) is not None
     return path if numbered and (path / "times.txt").is_file() and _cameras(path) else None
 

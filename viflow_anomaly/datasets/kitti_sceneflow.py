@@ -12,9 +12,9 @@ ROOT/
   raw_data/                                      or beside ROOT; see kitti_drives.py
 ```
 
-Line n + 1 of the mapping says which raw frame ``00000n_10.png`` is, ``2011_09_26 2011_09_26_drive_0005_sync 0000000059``
-(``_11`` is the next one), or is empty: the image is of no published drive. The paper uses the 140 of 200 images that
-map to a drive with continuous IMU around the pair; which ones these are is found here, not listed.
+Line n + 1 of the mapping says which raw frame ``00000n_10.png`` is (``_11`` is the next one), as in
+``2011_09_26 2011_09_26_drive_0005_sync 0000000059``, or is empty: the image is of no published drive. The paper uses
+the 140 of 200 images that map to a drive with continuous IMU around the pair; which these are is found, not listed.
 """
 
 from __future__ import annotations

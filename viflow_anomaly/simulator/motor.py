@@ -1,4 +1,4 @@
-"""What the platform's own sensors or commands say of its speed: a car's wheel odometry, a drone's commanded velocity."""
+"""What the platform says of its own speed: wheel odometry of a car, commanded velocity of a drone."""
 
 from __future__ import annotations
 
