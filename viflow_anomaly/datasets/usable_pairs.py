@@ -60,8 +60,8 @@ def window_fault(
     ``imu_gap``."""
     side = BLANK_SIDE_PX
     blank = np.zeros((side, side) if camera is None else (camera.height, camera.width), np.uint8)
-    pair = FramePair(Frame(interval.source_ns, blank), Frame(interval.target_ns, blank), imu, camera)
     try:
+        pair = FramePair(Frame(interval.source_ns, blank), Frame(interval.target_ns, blank), imu, camera)
         faults = build_motion_window(pair, config).faults
     except InvalidInputError as err:
         return err.code
