@@ -116,3 +116,10 @@ def test_a_simulated_recording_has_its_motor(sequence: Path) -> None:
             assert command[0] == pytest.approx(speeds[row], rel=0.01)
         else:
             assert np.linalg.norm(command) == pytest.approx(speeds[row + 20], rel=1e-6)
+
+
+def test_the_motors_generator_changes_no_other() -> None:
+    """Numbers of the generators that draw everything else: sequences made before there was a motor stay as they are."""
+    numbers = [sequences.STREAMS[name] for name in ("rig", "motion", "movers", "scene", "imu", "camera", "noise")]
+    assert numbers == list(range(7))
+    assert sequences.STREAMS["motor"] not in numbers
