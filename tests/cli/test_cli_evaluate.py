@@ -14,8 +14,8 @@ from simulated_truth import add_ground_truth, add_movers
 from worlds import make_world, write_euroc
 
 from viflow_anomaly.checkpoint import load_checkpoint, save_checkpoint
-from viflow_anomaly.cli import evaluate as evaluate_module
 from viflow_anomaly.config import ModelConfig
+from viflow_anomaly.evaluation.flow_report import cpu_model
 from viflow_anomaly.model.builder import build_model
 
 
@@ -155,7 +155,7 @@ def test_the_processor_has_a_name_everywhere(monkeypatch: pytest.MonkeyPatch, co
         patch.setattr(Path, "read_text", read_text)
         patch.setattr("platform.processor", lambda: "")
         patch.setattr("platform.machine", lambda: "riscv64")
-        assert evaluate_module._cpu_model() == "riscv64"
+        assert cpu_model() == "riscv64"
 
 
 # --- evaluate detect

@@ -165,7 +165,7 @@ def refusal(folder: Path, *, at_once: bool) -> DatasetError:
     def measure(folders: list[Path]) -> None:
         measured(ConstantFlow((0.0, 0.0)), config_of(FOCAL_PX), folders)
 
-    with pytest.raises(DatasetError, match=str(folder)) as raised:
+    with pytest.raises(DatasetError, match=folder.name) as raised:
         (require_ground_truth if at_once else measure)([folder])
     return raised.value
 
