@@ -56,6 +56,10 @@ def flow(
         Path | None,
         typer.Option(metavar="DIR", help="The folder that holds groundtruth0, for one recording (default: its own)."),
     ] = None,
+    movers: Annotated[
+        bool,
+        typer.Option(help="Count pixels of moving things, too: the truth there is what a resting thing would show."),
+    ] = True,
     look_aheads: Annotated[
         str, typer.Option(metavar="LIST", help="Frames between source and target, comma-separated, 1 to 4.")
     ] = "1",
@@ -107,7 +111,7 @@ def flow(
         require_matplotlib()
     cv2.setNumThreads(settings.threads)
     named = _checkpoints(checkpoint, settings)
-    truths = _truths(recordings, _numbers(look_aheads), ground_truth)
+    truths = _truths(recordings, _numbers(look_aheads), ground_truth, movers)
     baselines, left_out = _baselines(methods)
     networks = _networks(named, settings)
     chosen = [*baselines, *_result_files(results or [], truths, max_pairs), *networks]
@@ -123,7 +127,11 @@ def flow(
             on_progress=lambda done, total: progress.update(task, completed=done, total=total),
         )
     options: dict[str, Any] = {"look_aheads": _numbers(look_aheads), "max_pairs": max_pairs, "crop_px": crop}
-    options |= {"repeats": repeats, "correction": settings.detector.correction.model_dump(mode="json")}
+    options |= {
+        "movers": movers,
+        "repeats": repeats,
+        "correction": settings.detector.correction.model_dump(mode="json"),
+    }
     report = flow_report(measurement, threads=settings.threads, left_out=left_out, options=options)
     _write(report, out, markdown, latex)
     if plots is not None:
@@ -164,7 +172,9 @@ def _named(text: str) -> tuple[str | None, str]:
     return (name, value) if equals and name and "/" not in name else (None, text)
 
 
-def _truths(recordings: Sequence[Path], look_aheads: Sequence[int], ground_truth: Path | None) -> list[FlowTruth]:
+def _truths(
+    recordings: Sequence[Path], look_aheads: Sequence[int], ground_truth: Path | None, movers: bool
+) -> list[FlowTruth]:
     from viflow_anomaly.errors import ConfigError
     from viflow_anomaly.evaluation.flow_truth import RecordingTruth
 
@@ -176,7 +186,7 @@ def _truths(recordings: Sequence[Path], look_aheads: Sequence[int], ground_truth
         )
     truths: list[FlowTruth] = []
     for path in recordings:
-        truth = RecordingTruth(path, look_aheads, ground_truth=ground_truth)
+        truth = RecordingTruth(path, look_aheads, ground_truth=ground_truth, movers=movers)
         truth.truth(0)  # a long run does not find out at its end
         truths.append(truth)
     return truths

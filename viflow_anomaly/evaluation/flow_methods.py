@@ -29,7 +29,7 @@ class MethodAbout:
     Attributes:
         name: of the row, unique in a run.
         kind: ``network`` (ours), ``baseline`` (computed here), ``results`` (read from files).
-        preset, hypotheses: of a network.
+        preset, inputs, hypotheses: of a network; ``inputs`` is the motion that it eats.
         corrected: whether the network's flow was corrected on the target image.
         details: more for the JSON (checksum, runtime, folder).
     """
@@ -37,9 +37,17 @@ class MethodAbout:
     name: str
     kind: MethodKind
     preset: str | None = None
+    inputs: str | None = None
     hypotheses: int | None = None
     corrected: bool = False
     details: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def series(self) -> str:
+        """What networks that differ in their hypotheses alone have in common; other methods stand alone."""
+        if self.hypotheses is None:
+            return self.name
+        return f"{self.preset} {self.inputs}" + (CORRECTED if self.corrected else "")
 
 
 class NoEstimateError(Exception):
@@ -95,6 +103,7 @@ class NetworkMethod:
             name=name + (CORRECTED if correction.enabled else ""),
             kind="network",
             preset=record.model.preset,
+            inputs=motion_inputs(record.model),
             hypotheses=record.model.hypotheses,
             corrected=correction.enabled,
             details={
@@ -117,6 +126,12 @@ class NetworkMethod:
         if shown is not None:
             flow[~shown] = np.nan
         return flow
+
+
+def motion_inputs(model: ModelConfig) -> str:
+    """The motion that a network eats, as tables name it."""
+    del model  # every network eats IMU samples so far
+    return "imu"
 
 
 def network_methods(

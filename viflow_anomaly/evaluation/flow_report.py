@@ -95,6 +95,7 @@ def _about(about: MethodAbout) -> dict[str, Any]:
     return {
         "kind": about.kind,
         "preset": about.preset,
+        "inputs": about.inputs,
         "hypotheses": about.hypotheses,
         "corrected": about.corrected,
         **about.details,

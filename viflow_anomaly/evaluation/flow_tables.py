@@ -49,7 +49,7 @@ def sequence_table(report: Report) -> Table:
 
 def paper_table(report: Report) -> Table:
     """The paper's own figures."""
-    heads = ("algorithm", "K")
+    heads: tuple[str, ...] = ("algorithm", "K")
     for data in ("KITTI", "EuRoC"):
         heads += tuple(f"{data} {name}" for name in ("mean", "sd", "median"))
     heads += ("ms", "quotient KITTI", "quotient EuRoC")
@@ -66,7 +66,7 @@ def paper_table(report: Report) -> Table:
 def _scope_table(report: Report, scope: str, figures: dict[str, Any]) -> Table:
     pairs = max(one["pairs"] + sum(one["missing_pairs"].values()) for one in figures.values())
     missing = any(one["missing_pairs"] for one in figures.values())
-    heads = ("method", "preset", "K", *(head for head, _, _ in FIGURES)) + (("missing",) if missing else ())
+    heads = ("method", "preset", "inputs", "K", *(head for head, _, _ in FIGURES)) + (("missing",) if missing else ())
     rows = []
     for name, about in report["methods"].items():
         one = figures[name]
@@ -75,9 +75,9 @@ def _scope_table(report: Report, scope: str, figures: dict[str, Any]) -> Table:
             for _, key, digits in FIGURES
         ]
         left = [str(sum(one["missing_pairs"].values()))] if missing else []
-        rows.append((name, _text(about["preset"]), _text(about["hypotheses"]), *values, *left))
+        rows.append((name, _text(about["preset"]), _text(about["inputs"]), _text(about["hypotheses"]), *values, *left))
     title = "all pairs" if scope == ALL else scope
-    return Table(f"{title}: {pairs} pairs", heads, tuple(rows), 2)
+    return Table(f"{title}: {pairs} pairs", heads, tuple(rows), 3)
 
 
 def notes(report: Report) -> list[str]:

@@ -18,6 +18,8 @@ from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.sensor_data import FramePair
 
+BoolArray = NDArray[np.bool_]
+
 
 class PairName(NamedTuple):
     """Which pair: its sequence, how many frames apart, both stamps in nanoseconds."""
@@ -35,7 +37,7 @@ class TrueFlow(NamedTuple):
     """flow_px [H, W, 2] float32 in source-image pixels, valid [H, W] where it is known."""
 
     flow_px: Float32Array
-    valid: NDArray[np.bool_]
+    valid: BoolArray
 
 
 class FlowTruth(Protocol):
@@ -84,14 +86,24 @@ class RecordingTruth:
         path: the recording.
         look_aheads: each between 1 and 4.
         ground_truth: the folder that holds ``groundtruth0``; None: the recording itself.
+        movers: False: pixels of moving things do not count. The truth is the static world's, so that on a mover a
+            method is wrong for seeing it; needs ``groundtruth0/instances``.
 
     Raises:
         DatasetError: ``ground_truth_missing`` without ground truth or pairs; as ``open_recording``.
         InvalidInputError: as ``RecordingPairs``.
     """
 
-    def __init__(self, path: Path, look_aheads: Sequence[int] = (1,), *, ground_truth: Path | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        look_aheads: Sequence[int] = (1,),
+        *,
+        ground_truth: Path | None = None,
+        movers: bool = True,
+    ) -> None:
         self.recording = open_recording(path)
+        self._movers = movers
         self._look_aheads = tuple(look_aheads)
         truth = SimulatedGroundTruth.find(self.recording.root if ground_truth is None else ground_truth)
         self.pairs = pairs_for(self.recording, self._look_aheads, None)
@@ -123,7 +135,9 @@ class RecordingTruth:
         return self._pairs_by_model[model][index]
 
     def truth(self, index: int) -> TrueFlow:
-        return TrueFlow(*self.ground_truth.static_flow(*self.pairs.stamps(index)))
+        stamps = self.pairs.stamps(index)
+        flow, valid = self.ground_truth.static_flow(*stamps)
+        return TrueFlow(flow, valid if self._movers else valid & (self.ground_truth.instances(stamps[0]) == 0))
 
 
 def spread(truths: Sequence[FlowTruth], max_pairs: int | None) -> list[tuple[FlowTruth, int]]:
