@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -101,7 +102,7 @@ def _read(path: Path) -> Float32Array:
         flow, valid = read_flow_png(path)
         return np.where(valid[..., None], flow, np.float32(np.nan))
     try:
-        array = np.load(path, allow_pickle=False)
+        array = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
     except (OSError, ValueError, EOFError) as err:
         raise _malformed(path, "an array of floats in NumPy's format", str(err)) from err
     if not isinstance(array, np.ndarray) or not np.issubdtype(array.dtype, np.floating):

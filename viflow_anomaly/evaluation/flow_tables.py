@@ -77,7 +77,7 @@ def _scope_table(report: Report, scope: str, figures: dict[str, Any]) -> Table:
         left = [str(sum(one["missing_pairs"].values()))] if missing else []
         rows.append((name, _text(about["preset"]), _text(about["inputs"]), _text(about["hypotheses"]), *values, *left))
     title = "all pairs" if scope == ALL else scope
-    return Table(f"{title}: {pairs} pairs", heads, tuple(rows), 3)
+    return Table(f"{title}: {pairs} pair{'' if pairs == 1 else 's'}", heads, tuple(rows), 3)
 
 
 def notes(report: Report) -> list[str]:

@@ -1,7 +1,8 @@
 """Table I of "Multi-Hypothesis Visual-Inertial Flow" (Shamwell, Nothwang, Perlis), as printed.
 
 Measured by its authors on their data (KITTI and EuRoC, the middle 224x224 px) and their machine (Titan X): figures to
-stand beside ours, not in one table with them. The quotient is mean EPE x runtime x 0.01; it is kept as printed, too.
+stand beside ours, not in one table with them. The quotient is mean EPE x runtime x 0.01 and kept as printed, too:
+DeepMatching's and DSP's on KITTI do not follow from the printed mean and runtime (28.84 for 7.24, 95.3 for 63.98).
 """
 
 from __future__ import annotations
