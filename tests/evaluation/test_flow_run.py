@@ -114,7 +114,7 @@ def test_max_pairs_are_spread(truths: list[RecordingTruth]) -> None:
 
 
 class Broken(RecordingTruth):
-    """Its first pair has no usable IMU, its second no valid pixel."""
+    """Its first pair has no usable IMU, its second no valid pixel, its third no ground truth."""
 
     def pair(self, index: int, model: ModelConfig | None = None) -> FramePair:
         if index == 0:
@@ -122,18 +122,29 @@ class Broken(RecordingTruth):
         return super().pair(index, model)
 
     def truth(self, index: int) -> TrueFlow:
+        if index == 2:
+            raise DatasetError("no file", code="ground_truth_missing")
         true = super().truth(index)
         return TrueFlow(true.flow_px, true.valid & (index != 1))
 
 
 def test_pairs_that_cannot_be_used_are_left_out_for_all(tmp_path: Path) -> None:
-    folder = add_ground_truth(tmp_path / "drone_1", make_world(frames=4))
+    folder = add_ground_truth(tmp_path / "drone_1", make_world(frames=5))
     run = measure_flow_methods([Fixed("any", (0.0, 0.0))], [Broken(folder)])
-    assert run.skipped == {"imu_empty": 1, "no_valid_ground_truth": 1}
+    assert run.skipped == {"imu_empty": 1, "no_valid_ground_truth": 1, "ground_truth_missing": 1}
     assert run.total()["any"].pairs == 1
     with pytest.raises(DatasetError, match="imu_empty") as raised:
         measure_flow_methods([Fixed("any", (0.0, 0.0))], [Broken(folder)], max_pairs=1)
     assert raised.value.code == "ground_truth_missing"
+
+
+def test_malformed_ground_truth_ends_the_run(tmp_path: Path) -> None:
+    truth = RecordingTruth(add_ground_truth(tmp_path / "drone_1"))
+    stamp = truth.name(1).source_timestamp_ns
+    (truth.ground_truth.folder / "static_flow" / f"{stamp}.png").write_bytes(b"no picture")
+    with pytest.raises(DatasetError, match=f"{stamp}") as raised:
+        measure_flow_methods([Fixed("any", (0.0, 0.0))], [truth])
+    assert raised.value.code == "ground_truth_malformed"
 
 
 def test_ground_truth_of_another_size(tmp_path: Path) -> None:

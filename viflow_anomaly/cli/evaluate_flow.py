@@ -184,12 +184,7 @@ def _truths(
             code="ground_truth_ambiguous",
             field="ground_truth",
         )
-    truths: list[FlowTruth] = []
-    for path in recordings:
-        truth = RecordingTruth(path, look_aheads, ground_truth=ground_truth, movers=movers)
-        truth.truth(0)  # a long run does not find out at its end
-        truths.append(truth)
-    return truths
+    return [RecordingTruth(path, look_aheads, ground_truth=ground_truth, movers=movers) for path in recordings]
 
 
 def _baselines(text: str) -> tuple[list[FlowMethod], list[str]]:

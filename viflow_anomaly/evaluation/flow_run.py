@@ -28,7 +28,7 @@ class FlowMeasurement:
     Attributes:
         methods: the rows, in the order that they were given.
         sequences: statistics by sequence and method.
-        skipped: pairs that were measured with no method, by reason.
+        skipped: pairs that were measured with no method (no ground truth, no usable IMU), by reason.
     """
 
     methods: tuple[MethodAbout, ...]
@@ -140,7 +140,12 @@ def _measure_pair(
     clock: _Clock,
 ) -> str | None:
     """Measure one pair; why it was skipped, or None."""
-    true_px, valid = _cropped(truth.truth(index), crop_px)
+    try:
+        true_px, valid = _cropped(truth.truth(index), crop_px)
+    except DatasetError as err:
+        if err.code != "ground_truth_missing":
+            raise
+        return err.code  # real recordings have it for some of their pairs
     if not valid.any():
         return NO_TRUTH
     pairs: dict[ModelConfig | None, FramePair] = {}

@@ -65,7 +65,8 @@ class FlowTruth(Protocol):
         """The true flow from source to target.
 
         Raises:
-            DatasetError: ``ground_truth_missing``, ``ground_truth_malformed``.
+            DatasetError: ``ground_truth_missing`` for a pair without; it is left out and counted.
+                ``ground_truth_malformed``.
         """
 
 
