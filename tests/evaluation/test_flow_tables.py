@@ -106,7 +106,7 @@ def test_markdown_is_tables_of_equal_width(report: dict[str, Any]) -> None:
 
 def test_latex_escapes_and_closes_what_it_opens(report: dict[str, Any]) -> None:
     text = latex(report)
-    assert "k8\\_a|b & paper & imu & 8 & 4.000" in text
+    assert "k8\\_a\\textbar{}b & paper & imu & 8 & 4.000" in text
     assert "Sparse \\& Co & -- & -- & --" in text
     assert "F1-all \\%" in text
     for name in ("table", "tabular"):

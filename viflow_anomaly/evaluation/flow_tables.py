@@ -154,7 +154,15 @@ def _latex_row(cells: Sequence[str]) -> str:
     return "    " + " & ".join("--" if cell == NONE else _escaped_latex(cell) for cell in cells) + " \\\\"
 
 
-LATEX_SPECIAL = {"\\": "\\textbackslash{}", "~": "\\textasciitilde{}", "^": "\\textasciicircum{}"} | {
+LATEX_NAMED = {
+    "\\": "backslash",
+    "~": "asciitilde",
+    "^": "asciicircum",
+    "|": "bar",
+    "<": "less",
+    ">": "greater",
+}
+LATEX_SPECIAL = {character: f"\\text{name}{{}}" for character, name in LATEX_NAMED.items()} | {
     character: "\\" + character for character in "&%$#_{}"
 }
 
