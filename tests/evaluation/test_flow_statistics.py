@@ -41,6 +41,20 @@ def test_figures_are_those_of_all_pixels_at_once() -> None:
     assert found["epe_ratio"] == pytest.approx(error.mean() / length.mean(), abs=1e-4)
 
 
+def test_pixels_that_leave_the_image_are_told_apart() -> None:
+    """A third of a 9 px wide image moves 3 px to the right and out; the others err by 1 of 3 px."""
+    true = np.zeros((4, 9, 2), np.float32)
+    true[..., 0] = 3
+    flow = true.copy()
+    flow[:, :6, 0] += 1
+    flow[:, 6:, 0] += 30
+    statistics = FlowStatistics()
+    statistics.add_pair(flow, true, np.ones((4, 9), bool))
+    found = statistics.summary()
+    assert (found["inside_epe_mean_px"], found["inside_epe_ratio"]) == (1.0, pytest.approx(1 / 3, abs=1e-4))
+    assert found["epe_mean_px"] == pytest.approx((6 * 1 + 3 * 30) / 9, abs=1e-4)
+
+
 def test_merging_is_adding() -> None:
     parts = [FlowStatistics() for _ in range(3)]
     whole, merged = FlowStatistics(), FlowStatistics()

@@ -68,6 +68,7 @@ def test_one_table_for_each_group_and_all(report: dict[str, Any]) -> None:
         "sd": "0.000",
         "median": row[heads.index("median")],
         "F1-all %": "100.0",
+        "inside": "-",
         "ratio": "0.800",
         "density %": "100.0",
         "ms": "8.00",
@@ -106,7 +107,7 @@ def test_markdown_is_tables_of_equal_width(report: dict[str, Any]) -> None:
 
 def test_latex_escapes_and_closes_what_it_opens(report: dict[str, Any]) -> None:
     text = latex(report)
-    assert "k8\\_a|b & paper & imu & 8 & 4.000" in text
+    assert "k8\\_a\\textbar{}b & paper & imu & 8 & 4.000" in text
     assert "Sparse \\& Co & -- & -- & --" in text
     assert "F1-all \\%" in text
     for name in ("table", "tabular"):

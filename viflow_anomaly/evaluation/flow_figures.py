@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
-from viflow_anomaly.evaluation.flow_methods import CORRECTED, FlowMethod, MethodAbout, NoEstimateError
+from viflow_anomaly.evaluation.flow_methods import FlowMethod, MethodAbout, NoEstimateError
 from viflow_anomaly.evaluation.flow_pictures import correspondence_picture, flow_wheel_picture
 from viflow_anomaly.evaluation.flow_run import ByMethod, FlowMeasurement, group_of
 from viflow_anomaly.evaluation.flow_truth import FlowTruth, spread
+from viflow_anomaly.evaluation.paper_table import PAPER_TABLE
 from viflow_anomaly.evaluation.plot_style import SavedPicture
 from viflow_anomaly.evaluation.plots import FlowPoint, epe_by_hypotheses, epe_by_runtime, hypothesis_wins
 from viflow_anomaly.geometry import Float32Array
 
-MAX_PANELS = 7
-"""Methods in one flow picture: beyond that panels would be too small to read."""
+MAX_NETWORKS, MAX_PANELS = 4, 7
+"""Methods in one flow picture, the best of each kind: beyond that panels would be too small to read."""
 
 
 def draw_flow_figures(
@@ -30,6 +32,7 @@ def draw_flow_figures(
 ) -> list[SavedPicture]:
     """Draw a run into ``folder``.
 
+    A picture of a pair shows the best networks and the best others by mean EPE; the correspondences are the best one's.
     ``flow-GROUP`` and ``correspondences-GROUP`` (the pair in the middle of the group's), ``epe-runtime-GROUP``,
     ``epe-hypotheses-GROUP`` where networks differ in K, and ``wins-NAME`` where a checkpoint's training left its log.
 
@@ -43,9 +46,9 @@ def draw_flow_figures(
         InvalidInputError: ``metrics_malformed``; as the truths and methods raise.
     """
     pictures = []
-    for group, (truth, index) in _middle_pairs(spread(truths, max_pairs)).items():
-        pictures += _draw_pair(folder, group, methods, truth, index)
     groups = measurement.groups()
+    for group, (truth, index) in _middle_pairs(spread(truths, max_pairs)).items():
+        pictures += _draw_pair(folder, group, _best_methods(methods, groups[group]), truth, index)
     for name, by_method in (groups if len(groups) == 1 else {**groups, "all": measurement.total()}).items():
         pictures += _draw_charts(folder, name, measurement.methods, by_method)
     for name, log in (training_logs or {}).items():
@@ -66,6 +69,28 @@ def flow_points(methods: Sequence[MethodAbout], by_method: ByMethod) -> list[Flo
     return points
 
 
+def paper_points(data: Literal["kitti", "euroc"]) -> list[FlowPoint]:
+    """The paper's own figures as points, to be drawn in a chart of their own."""
+    points = []
+    for row in PAPER_TABLE:
+        errors = row.kitti if data == "kitti" else row.euroc
+        label = row.algorithm if row.hypotheses is None else f"{row.algorithm} K={row.hypotheses}"
+        points.append(FlowPoint(row.algorithm, label, errors.mean_px, row.hypotheses, row.runtime_ms))
+    return points
+
+
+def _best_methods(methods: Sequence[FlowMethod], by_method: ByMethod) -> list[FlowMethod]:
+    """Networks first, each kind from the best mean EPE up; no identity, whose picture is white."""
+
+    def error_px(method: FlowMethod) -> float:
+        mean_px = by_method[method.about.name].summary()["epe_mean_px"]
+        return float("inf") if mean_px is None else float(mean_px)
+
+    ranked = sorted((method for method in methods if method.about.name != "identity"), key=error_px)
+    networks = [method for method in ranked if method.about.kind == "network"][:MAX_NETWORKS]
+    return (networks + [method for method in ranked if method.about.kind != "network"])[:MAX_PANELS]
+
+
 def _middle_pairs(chosen: Sequence[tuple[FlowTruth, int]]) -> dict[str, tuple[FlowTruth, int]]:
     groups: dict[str, list[tuple[FlowTruth, int]]] = {}
     for truth, index in chosen:
@@ -79,8 +104,7 @@ def _draw_pair(
     true_px, valid = truth.truth(index)
     pair = truth.pair(index)
     flows: dict[str, Float32Array] = {}
-    shown = sorted(methods, key=lambda method: method.about.kind != "network")
-    for method in [one for one in shown if one.about.name != "identity"][:MAX_PANELS]:
+    for method in methods:
         try:
             flows[method.about.name] = method.flow(truth.pair(index, method.motor_source), truth.name(index))
         except NoEstimateError:
@@ -89,7 +113,7 @@ def _draw_pair(
         return []
     name = _file_name(group)
     pictures = [flow_wheel_picture(pair.source.image, true_px, valid, flows, folder / f"flow-{name}")]
-    best = next((one for one in flows if one.endswith(CORRECTED)), next(iter(flows)))
+    best = next(iter(flows))
     if (valid & np.isfinite(flows[best]).all(axis=-1)).any():
         images = (pair.source.image, pair.target.image)
         stem = folder / f"correspondences-{name}"

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.geometry import Float32Array, pixel_grid
 
 BoolArray = NDArray[np.bool_]
 
@@ -43,6 +43,7 @@ class FlowStatistics:
         estimated_px: those of them with an estimate; all measures are over these.
         identity_sum_px: sum of the true flow's length over them: what "no motion" would have been wrong by.
         outliers: KITTI's, among them.
+        inside: those of them whose true target lies in the image: count, sum of their errors and of the true lengths.
         runtimes_ms: one for each timed run, 8 bytes each.
     """
 
@@ -51,6 +52,7 @@ class FlowStatistics:
     valid_px: int = 0
     estimated_px: int = 0
     outliers: int = 0
+    inside: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     identity_sum_px: float = 0.0
     runtimes_ms: array[float] = field(default_factory=lambda: array("d"))
     _mean_px: float = 0.0
@@ -73,6 +75,8 @@ class FlowStatistics:
         self.valid_px += int(np.count_nonzero(valid))
         self.outliers += int(np.count_nonzero((errors > OUTLIER_PX) & (errors > OUTLIER_SHARE * lengths)))
         self.identity_sum_px += float(lengths.sum())
+        stays = _stays(true_px)[used]
+        self.inside += (np.count_nonzero(stays), errors[stays].sum(), lengths[stays].sum())
         if errors.size:
             mean = float(errors.mean())
             self._add_moments(errors.size, mean, float(((errors - mean) ** 2).sum()))
@@ -85,6 +89,7 @@ class FlowStatistics:
         self.valid_px += other.valid_px
         self.outliers += other.outliers
         self.identity_sum_px += other.identity_sum_px
+        self.inside += other.inside
         self.runtimes_ms.extend(other.runtimes_ms)
         self._histogram += other._histogram
         if other.estimated_px:
@@ -126,9 +131,18 @@ class FlowStatistics:
             "f1_all": _rounded(self.outliers / self.estimated_px if known else math.nan, 6),
             "identity_epe_px": _rounded(identity),
             "epe_ratio": _rounded(mean / identity if identity else math.nan),
+            "inside_epe_mean_px": _rounded(self.inside[1] / self.inside[0] if self.inside[0] else math.nan),
+            "inside_epe_ratio": _rounded(self.inside[1] / self.inside[2] if self.inside[2] else math.nan),
             "runtime_ms": _rounded(runtime_ms),
             "quotient": _rounded(mean * runtime_ms * QUOTIENT_SCALE),
         }
+
+
+def _stays(true_px: Float32Array) -> BoolArray:
+    """[H, W] whether the true target lies in the image."""
+    height, width = true_px.shape[:2]
+    at = true_px + pixel_grid(height, width)
+    return np.asarray(((at >= 0) & (at <= (width - 1, height - 1))).all(axis=-1))
 
 
 def _bins(errors_px: NDArray[np.float64]) -> NDArray[np.intp]:

@@ -25,6 +25,7 @@ FIGURES: tuple[tuple[str, str, int], ...] = (
     ("median", "epe_median_px", 3),
     ("F1-all %", "f1_all", 1),
     ("ratio", "epe_ratio", 3),
+    ("inside", "inside_epe_ratio", 3),
     ("density %", "density", 1),
     ("ms", "runtime_ms", 2),
     ("quotient", "quotient", 3),
@@ -154,7 +155,15 @@ def _latex_row(cells: Sequence[str]) -> str:
     return "    " + " & ".join("--" if cell == NONE else _escaped_latex(cell) for cell in cells) + " \\\\"
 
 
-LATEX_SPECIAL = {"\\": "\\textbackslash{}", "~": "\\textasciitilde{}", "^": "\\textasciicircum{}"} | {
+LATEX_NAMED = {
+    "\\": "backslash",
+    "~": "asciitilde",
+    "^": "asciicircum",
+    "|": "bar",
+    "<": "less",
+    ">": "greater",
+}
+LATEX_SPECIAL = {character: f"\\text{name}{{}}" for character, name in LATEX_NAMED.items()} | {
     character: "\\" + character for character in "&%$#_{}"
 }
 

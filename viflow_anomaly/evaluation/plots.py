@@ -166,7 +166,7 @@ def hypothesis_wins(metrics: Path, stem: Path, *, title: str | None = None) -> S
         axes.set_ylabel("share of wins [%]")
         axes.set_ylim(bottom=0)
         _titled(axes, title)
-        figure.legend(loc="outside lower center", ncols=4, title="hypothesis (gray: equal shares)")
+        figure.legend(loc="outside lower center", ncols=4, title="hypothesis (level line: equal shares)")
     return saved(stem)
 
 
