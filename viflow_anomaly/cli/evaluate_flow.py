@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from viflow_anomaly.evaluation.flow_methods import FlowMethod, NetworkMethod
     from viflow_anomaly.evaluation.flow_run import FlowMeasurement
     from viflow_anomaly.evaluation.flow_tables import Table
-    from viflow_anomaly.evaluation.flow_truth import FlowTruth
+    from viflow_anomaly.evaluation.flow_truth import FlowTruth, RecordingTruth
     from viflow_anomaly.settings import Settings
 
 DEFAULT, NONE = "default", "none"
@@ -66,6 +66,10 @@ def flow(
     max_pairs: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Measure N pairs, evenly spread (default: all).")
     ] = None,
+    test_part: Annotated[
+        bool,
+        typer.Option("--test-part", help="Measure only the pairs that training.split keeps for the test (--set)."),
+    ] = False,
     crop: Annotated[
         int | None,
         typer.Option(min=1, metavar="PX", help="Measure the middle PX x PX pixels only (the paper: 224)."),
@@ -111,7 +115,8 @@ def flow(
         require_matplotlib()
     cv2.setNumThreads(settings.threads)
     named = _checkpoints(checkpoint, settings)
-    truths = _truths(recordings, _numbers(look_aheads), ground_truth, movers)
+    whole = _truths(recordings, _numbers(look_aheads), ground_truth, movers)
+    truths: Sequence[FlowTruth] = _test_parts(whole, settings) if test_part else whole
     baselines, left_out = _baselines(methods)
     networks = _networks(named, settings)
     chosen = [*baselines, *_result_files(results or [], truths, max_pairs), *networks]
@@ -174,7 +179,7 @@ def _named(text: str) -> tuple[str | None, str]:
 
 def _truths(
     recordings: Sequence[Path], look_aheads: Sequence[int], ground_truth: Path | None, movers: bool
-) -> list[FlowTruth]:
+) -> Sequence[RecordingTruth]:
     from viflow_anomaly.errors import ConfigError
     from viflow_anomaly.evaluation.flow_truth import RecordingTruth
 
@@ -185,6 +190,20 @@ def _truths(
             field="ground_truth",
         )
     return [RecordingTruth(path, look_aheads, ground_truth=ground_truth, movers=movers) for path in recordings]
+
+
+def _test_parts(truths: Sequence[RecordingTruth], settings: Settings) -> Sequence[FlowTruth]:
+    from viflow_anomaly.errors import ConfigError
+    from viflow_anomaly.evaluation.flow_truth import TestPart
+
+    split = settings.training.split
+    if split.rule == "none":
+        raise ConfigError(
+            "--test-part: expected the split that the training had (--set training.split.rule=blocks), found none",
+            code="split_rule_unknown",
+            field="training.split.rule",
+        )
+    return [TestPart(truth, split) for truth in truths]
 
 
 def _baselines(text: str) -> tuple[list[FlowMethod], list[str]]:

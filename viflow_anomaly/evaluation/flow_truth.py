@@ -9,10 +9,11 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from viflow_anomaly.config import MotorSource
+from viflow_anomaly.config import MotorSource, SplitConfig
 from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.datasets.registry import open_recording
 from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
+from viflow_anomaly.datasets.splits import split_pairs
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.sensor_data import FramePair
@@ -129,6 +130,44 @@ class RecordingTruth:
         stamps = self.pairs.stamps(index)
         flow, valid = self.ground_truth.static_flow(*stamps)
         return TrueFlow(flow, valid if self._movers else valid & (self.ground_truth.instances(stamps[0]) == 0))
+
+
+class TestPart:
+    """The pairs of a recording that a split keeps for the test (``SplitConfig``; its training never saw them).
+
+    Args:
+        whole: the recording.
+        split: as the training had it, with the same look-aheads.
+
+    Raises:
+        InvalidInputError: as ``split_pairs``.
+    """
+
+    __test__ = False  # pytest: no test
+
+    def __init__(self, whole: RecordingTruth, split: SplitConfig) -> None:
+        assert split.rule != "none"
+        parts = split_pairs(
+            whole.pairs, split.rule, seed=split.seed, test_share=split.test_share, block_s=split.block_s
+        )
+        self._whole = whole
+        self._indices = parts.test
+
+    @property
+    def sequence(self) -> str:
+        return self._whole.sequence
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def name(self, index: int) -> PairName:
+        return self._whole.name(self._indices[index])
+
+    def pair(self, index: int, motor_source: MotorSource | None = None) -> FramePair:
+        return self._whole.pair(self._indices[index], motor_source)
+
+    def truth(self, index: int) -> TrueFlow:
+        return self._whole.truth(self._indices[index])
 
 
 def spread(truths: Sequence[FlowTruth], max_pairs: int | None) -> list[tuple[FlowTruth, int]]:
