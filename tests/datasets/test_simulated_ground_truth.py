@@ -8,16 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from viflow_anomaly.datasets.simulated_ground_truth import (
-    OBJECT_COLUMNS,
-    MovingObject,
-    SimulatedGroundTruth,
+from viflow_anomaly.datasets.ground_truth_png import (
     read_depth_png,
     read_flow_png,
     write_depth_png,
     write_flow_png,
     write_instances_png,
 )
+from viflow_anomaly.datasets.simulated_ground_truth import OBJECT_COLUMNS, MovingObject, SimulatedGroundTruth
 from viflow_anomaly.errors import DatasetError
 
 STAMPS = (1_000_000_000, 1_050_000_000, 1_100_000_000)
