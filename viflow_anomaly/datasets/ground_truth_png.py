@@ -1,7 +1,8 @@
 """The pictures of ground truth: depth, flow, masks.
 
 Flow PNGs are KITTI's: 16 bit, three channels, value = 64 * flow + 2^15, third channel 1 where valid. Depth PNGs are
-16 bit, 256 steps a metre, 0 where nothing is known. Masks are 8 bit. Every file is written beside its place and renamed.
+16 bit, 256 steps a metre, 0 where nothing is known. Masks are 8 bit. Every file is
+written beside its place and renamed.
 """
 
 from __future__ import annotations

@@ -184,7 +184,7 @@ class SimulatedGroundTruth:
         The stored PNG for the next frame, else from the depth of both frames and the poses.
 
         Raises:
-            DatasetError: ``ground_truth_missing`` (also where the target has no dense depth), ``ground_truth_malformed``.
+            DatasetError: ``ground_truth_missing`` (also where the target has no depth), ``ground_truth_malformed``.
         """
         stored = self.folder / "occluded" / f"{source_ns}.png"
         if target_ns == self._next_stamps.get(source_ns) and stored.is_file():

@@ -171,9 +171,7 @@ def _read_ascii(path: Path, file: BinaryIO, elements: list[_Element]) -> Float32
         warnings.simplefilter("ignore")  # numpy warns where the data end early; the count below says so better
         try:
             text = io.TextIOWrapper(file, encoding="ascii")
-            points = np.loadtxt(
-                text, dtype=np.float32, usecols=columns, max_rows=vertex.count, comments=None, ndmin=2
-            )
+            points = np.loadtxt(text, dtype=np.float32, usecols=columns, max_rows=vertex.count, comments=None, ndmin=2)
         except ValueError as err:
             raise _malformed(path, f"expected {vertex.count} lines of {' '.join(names)}, found {err}") from err
     if len(points) != vertex.count:
