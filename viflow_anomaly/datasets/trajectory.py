@@ -44,7 +44,7 @@ class Trajectory:
         stamps = self.timestamps_ns
         after = int(np.searchsorted(stamps, timestamp_ns))
         if after < stamps.size and stamps[after] == timestamp_ns:
-            return self.T_world_cam[after].copy()
+            return np.array(self.T_world_cam[after])
         inside = 0 < after < stamps.size
         if not inside or int(stamps[after] - stamps[after - 1]) > MAX_POSE_GAP_NS:
             found = f"a gap from {stamps[after - 1]} to {stamps[after]}" if inside else f"{stamps[0]} to {stamps[-1]}"

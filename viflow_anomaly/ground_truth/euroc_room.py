@@ -1,8 +1,8 @@
 """Static flow for EuRoC's Vicon rooms, from the room's point cloud (the paper's appendix).
 
 Depth is rendered from the cloud at every frame's pose. Each pixel's ray, with the lens undone, is scaled by its depth,
-moved by ``T_target_source = inv(T_world_cam(t1)) T_world_cam(t0)``, and projected with the lens: from the frame at t0 to
-where its points are in the frame at t1. (The paper writes H the other way round; that is the motion of t1's points.)
+moved by ``T_target_source = inv(T_world_cam(t1)) T_world_cam(t0)``, and projected with the lens: from the frame at t0
+to where its points are in the frame at t1. (The paper writes H the other way round: the motion of t1's points.)
 """
 
 from __future__ import annotations

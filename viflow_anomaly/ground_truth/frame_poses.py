@@ -51,7 +51,8 @@ def read_trajectory_file(path: Path, cam_yaml: Path) -> Trajectory:
 
 
 def _read_tum(path: Path) -> tuple[Int64Array, Float64Array]:
-    stamps, rows = [], []
+    stamps: list[int] = []
+    rows = []
     for line in read_lines(path):
         if line.text.startswith("#"):
             continue
@@ -84,7 +85,7 @@ def _no_mounting(cam_yaml: Path) -> DatasetError:
 
 
 def poses_of_frames(trajectory: Trajectory, stamps_ns: Sequence[int]) -> dict[int, Float64Array]:
-    """{stamp: T_world_cam [4, 4]} of the frames that have a pose: one within 1 ms, or between two at most 10 ms apart."""
+    """{stamp: T_world_cam [4, 4]} of the frames with a pose: one within 1 ms, or between two at most 10 ms apart."""
     found = {}
     times = trajectory.timestamps_ns
     for stamp in stamps_ns:

@@ -3,8 +3,8 @@
 A pixel lies on a surface when points surround it: one in each of the four quadrants around it, within the reach of
 that point (a few times the cloud's spacing there, seen from here). Its front is the farthest of the four nearest. So a
 hole between points is closed and what lies behind does not shine through, while nothing grows beyond its own outline
-(cf. screen-space visibility of points, Pintus et al. 2011). Points behind their pixel's front are hidden. The depth is a
-plane in inverse depth, fitted to the points that are not hidden around each pixel: exact on flat walls.
+(cf. screen-space visibility of points, Pintus et al. 2011). Points behind their pixel's front are hidden. The depth is
+a plane in inverse depth, fitted to the points that are not hidden around each pixel: exact on flat walls.
 """
 
 from __future__ import annotations
@@ -47,6 +47,10 @@ class ImagePoints(NamedTuple):
     cell: IntArray
     size: tuple[int, int]
 
+    def chosen(self, which: NDArray[np.bool_]) -> ImagePoints:
+        """Those of a mask [N]."""
+        return ImagePoints(self.place[which], self.depth_m[which], self.reach[which], self.cell[which], self.size)
+
 
 def render_depth(camera: PinholeCamera, cloud: PointCloud, T_world_cam: Float64Array) -> Float32Array:
     """Depth along the optical axis, [H, W] metres, inf where no surface is known.
@@ -60,9 +64,9 @@ def render_depth(camera: PinholeCamera, cloud: PointCloud, T_world_cam: Float64A
     front = front_depth(points)
     focal = min(camera.fx, camera.fy)
     reach_px = np.array(REACHES_PX)[points.reach]
+    # In the corner of a room, whose walls come nearer on all sides, the front is nearer by up to a reach.
     seen = points.depth_m <= front.reshape(-1)[points.cell] + points.depth_m * (0.01 + 1.5 * reach_px / focal)
-    visible = ImagePoints(*(part[seen] for part in points[:4]), size=points.size)
-    depth = _close_holes(_fit(visible, front, focal), focal)
+    depth = _close_holes(_fit(points.chosen(seen), front, focal), focal)
     inner = slice(MARGIN_PX, -MARGIN_PX)
     return np.ascontiguousarray(depth[inner, inner])
 
