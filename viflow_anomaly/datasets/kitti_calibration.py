@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -25,24 +26,38 @@ NOMINAL_T_CAM0_IMU = np.array(
 )
 
 
-def read_raw_camera(folder: Path, number: str, size: tuple[int, int]) -> PinholeCamera | None:
+@dataclass(frozen=True)
+class CalibrationFiles:
+    """The raw data's three calibration files, where they may or may not be."""
+
+    cam_to_cam: Path
+    velo_to_cam: Path
+    imu_to_velo: Path
+
+    @classmethod
+    def of_date(cls, folder: Path) -> Self:
+        """Those of all drives of one day."""
+        return cls(*(folder / f"calib_{name}.txt" for name in ("cam_to_cam", "velo_to_cam", "imu_to_velo")))
+
+
+def read_raw_camera(files: CalibrationFiles, number: str, size: tuple[int, int]) -> PinholeCamera | None:
     """The camera ``image_<number>`` of the raw data.
 
     ``T_cam_imu = T_cam_cam0 T_cam0_velo T_velo_imu``. For rectified images T_cam_cam0 is R_rect_00 and the camera's
     place in the rectified frame, inv(K) P_rect[:, 3]; for unrectified ones it is R_0x, T_0x.
 
     Args:
-        folder: holds ``calib_cam_to_cam.txt``, ``calib_velo_to_cam.txt``, ``calib_imu_to_velo.txt``.
+        files: where the calibration is.
         number: ``"00"`` to ``"03"``.
         size: (width, height) of the images as stored; tells rectified from unrectified and finds reduced images.
 
     Returns:
-        None without ``calib_cam_to_cam.txt``; ``T_cam_imu`` None without the other two.
+        None without ``cam_to_cam``; ``T_cam_imu`` None without the other two.
 
     Raises:
         DatasetError: ``calibration_malformed``.
     """
-    path = folder / "calib_cam_to_cam.txt"
+    path = files.cam_to_cam
     if not path.is_file():
         return None
     counts = {"S": 2, "K": 9, "D": 5, "R": 9, "T": 3, "S_rect": 2, "P_rect": 12}
@@ -50,7 +65,7 @@ def read_raw_camera(folder: Path, number: str, size: tuple[int, int]) -> Pinhole
     calibration = _Calibration(path, values, number)
     try:
         camera, T_cam_cam0 = calibration.camera_for(size)
-        T_cam0_imu = _read_imu_to_cam0(folder)
+        T_cam0_imu = _read_imu_to_cam0(files)
         if T_cam0_imu is not None:
             camera = replace(camera, T_cam_imu=T_cam_cam0 @ T_cam0_imu)
         return camera.scaled_to(*size)
@@ -58,16 +73,19 @@ def read_raw_camera(folder: Path, number: str, size: tuple[int, int]) -> Pinhole
         raise _malformed(path, err.message) from err
 
 
-def read_odometry_camera(folder: Path, number: str, size: tuple[int, int]) -> PinholeCamera | None:
+def read_odometry_camera(
+    folder: Path, number: str, size: tuple[int, int], *, imu_to_velo: Path | None = None
+) -> PinholeCamera | None:
     """The camera ``image_<number>`` of an odometry sequence, from ``calib*.txt``.
 
-    Lines are ``P0: ...`` to ``P3:``, or unnamed in that order. With ``Tr`` (velodyne to image_0) and
-    ``calib_imu_to_velo.txt`` beside it ``T_cam_imu`` is exact, otherwise the nominal mounting is taken.
+    With ``Tr`` (velodyne to image_0) and the IMU's place ``T_cam_imu`` is exact, otherwise the nominal mounting is
+    taken.
 
     Args:
         folder: the sequence.
         number: ``"0"`` to ``"3"``.
         size: (width, height) of the images as stored; must be those that the calibration describes.
+        imu_to_velo: the IMU's place on the velodyne; None: ``calib_imu_to_velo.txt`` in the sequence's folder.
 
     Returns:
         None without a calibration file.
@@ -75,18 +93,15 @@ def read_odometry_camera(folder: Path, number: str, size: tuple[int, int]) -> Pi
     Raises:
         DatasetError: ``calibration_malformed``.
     """
-    path = odometry_calibration_file(folder)
-    if path is None:
+    found = _odometry_projection(folder, number)
+    if found is None:
         return None
-    named = {f"P{k}": 12 for k in range(4)} | {"Tr": 12}
-    lines = read_lines(path)
-    unnamed = not any(":" in line.text for line in lines)
-    values = read_calibration(path, named, names=tuple(named) if unnamed else None)
-    projection = _required(path, values, f"P{number}").reshape(3, 4)
+    path, values, projection = found
+    imu_to_velo = imu_to_velo or folder / "calib_imu_to_velo.txt"
     T_cam0_imu = NOMINAL_T_CAM0_IMU
-    if "Tr" in values and (folder / "calib_imu_to_velo.txt").is_file():
+    if "Tr" in values and imu_to_velo.is_file():
         T_cam0_velo = np.vstack([values["Tr"].reshape(3, 4), (0.0, 0.0, 0.0, 1.0)])
-        T_cam0_imu = T_cam0_velo @ _read_rigid(folder / "calib_imu_to_velo.txt")
+        T_cam0_imu = T_cam0_velo @ _read_rigid(imu_to_velo)
     try:
         camera, T_cam_cam0 = _pinhole(path, projection, size)
         camera = replace(camera, T_cam_imu=T_cam_cam0 @ T_cam0_imu)
@@ -100,6 +115,35 @@ def read_odometry_camera(folder: Path, number: str, size: tuple[int, int]) -> Pi
             "have they been resized?",
         )
     return camera
+
+
+def read_odometry_shift(folder: Path, number: str) -> Float64Array | None:
+    """T_cam_cam0 [4, 4], from image_0 to the rectified camera ``image_<number>``: a shift by inv(K) P[:, 3].
+
+    Returns:
+        None without a calibration file, except for image_0 itself.
+
+    Raises:
+        DatasetError: ``calibration_malformed``.
+    """
+    found = _odometry_projection(folder, number)
+    T_cam_cam0 = np.eye(4)
+    if found is not None:
+        path, _, projection = found
+        T_cam_cam0[:3, 3] = _place(path, projection)
+    return None if found is None and number != "0" else T_cam_cam0
+
+
+def _odometry_projection(folder: Path, number: str) -> tuple[Path, dict[str, Float64Array], Float64Array] | None:
+    """The calibration file, its keys, and P [3, 4] of one camera. Lines are ``P0: ...`` to ``P3:`` and ``Tr:``, or
+    unnamed in that order."""
+    path = odometry_calibration_file(folder)
+    if path is None:
+        return None
+    named = {f"P{k}": 12 for k in range(4)} | {"Tr": 12}
+    unnamed = not any(":" in line.text for line in read_lines(path))
+    values = read_calibration(path, named, names=tuple(named) if unnamed else None)
+    return path, values, _required(path, values, f"P{number}").reshape(3, 4)
 
 
 def odometry_calibration_file(folder: Path) -> Path | None:
@@ -173,19 +217,24 @@ def _pinhole(path: Path, projection: Float64Array, size: tuple[int, int]) -> tup
     camera = PinholeCamera(
         fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]), width=size[0], height=size[1]
     )
-    expected = np.array([[K[0, 0], 0.0, K[0, 2]], [0.0, K[1, 1], K[1, 2]], [0.0, 0.0, 1.0]])
-    if not np.allclose(K, expected):
-        raise _malformed(path, f"expected a projection matrix fx 0 cx, 0 fy cy, 0 0 1, found {K.tolist()}")
     T_cam_rect = np.eye(4)
-    T_cam_rect[:3, 3] = np.linalg.solve(K, projection[:, 3])
+    T_cam_rect[:3, 3] = _place(path, projection)
     return camera, T_cam_rect
 
 
-def _read_imu_to_cam0(folder: Path) -> Float64Array | None:
-    velo_to_cam, imu_to_velo = folder / "calib_velo_to_cam.txt", folder / "calib_imu_to_velo.txt"
-    if not velo_to_cam.is_file() or not imu_to_velo.is_file():
+def _place(path: Path, projection: Float64Array) -> Float64Array:
+    """P = K [I | t] -> t [3]."""
+    K = projection[:, :3]
+    expected = np.array([[K[0, 0], 0.0, K[0, 2]], [0.0, K[1, 1], K[1, 2]], [0.0, 0.0, 1.0]])
+    if not np.allclose(K, expected):
+        raise _malformed(path, f"expected a projection matrix fx 0 cx, 0 fy cy, 0 0 1, found {K.tolist()}")
+    return np.asarray(np.linalg.solve(K, projection[:, 3]))
+
+
+def _read_imu_to_cam0(files: CalibrationFiles) -> Float64Array | None:
+    if not files.velo_to_cam.is_file() or not files.imu_to_velo.is_file():
         return None
-    return np.asarray(_read_rigid(velo_to_cam) @ _read_rigid(imu_to_velo))
+    return np.asarray(_read_rigid(files.velo_to_cam) @ _read_rigid(files.imu_to_velo))
 
 
 def _read_rigid(path: Path) -> Float64Array:

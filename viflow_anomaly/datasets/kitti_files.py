@@ -16,25 +16,37 @@ from viflow_anomaly.config import ImageLimits
 from viflow_anomaly.datasets.tables import read_lines
 from viflow_anomaly.errors import DatasetError, ViflowError
 from viflow_anomaly.images import read_image_size
-from viflow_anomaly.sensor_data import Float64Array
+from viflow_anomaly.imu_log import ImuLog
+from viflow_anomaly.sensor_data import Float64Array, Int64Array
 
 # oxts/dataformat.txt: ax ay az and wx wy wz are along the unit's own axes (front, left, top); af al au and wf wl wu are
 # levelled to the horizon and no IMU would measure them.
 OXTS_COLUMNS = 30
+OXTS_PLACE = slice(0, 6)
 OXTS_FORWARD_SPEED = 8
 OXTS_ACCEL = slice(11, 14)
 OXTS_GYRO = slice(17, 20)
+
+SPEED_NAMES = ("forward_speed_m_s",)
+"""What a KITTI recording's motor command is: OXTS ``vf``."""
 
 STAMP = re.compile(r"(\d{4})-(\d\d)-(\d\d) (\d\d):(\d\d):(\d\d)\.(\d{1,9})", re.ASCII)
 
 
 @dataclass(frozen=True)
 class OxtsRow:
-    """One OXTS record: gyro [3] rad/s, accelerometer [3] m/s^2, both x front, y left, z top; forward speed m/s."""
+    """One OXTS record; the unit's axes are x front, y left, z top.
+
+    Args:
+        gyro_rad_s, accel_m_s2: [3] each.
+        forward_speed_m_s: along the ground.
+        place: [6] latitude and longitude in degrees, altitude in metres; roll, pitch and yaw in radians.
+    """
 
     gyro_rad_s: Float64Array
     accel_m_s2: Float64Array
     forward_speed_m_s: float
+    place: Float64Array
 
 
 def malformed(path: Path, line: int, code: str, problem: str) -> DatasetError:
@@ -103,11 +115,17 @@ def parse_oxts(path: Path, line: int, text: str) -> OxtsRow:
     cells = text.split()
     if len(cells) != OXTS_COLUMNS:
         raise malformed(path, line, "oxts_malformed", f"expected {OXTS_COLUMNS} numbers, found {len(cells)}")
-    values = np.array(_floats(path, line, "oxts_malformed", cells))
-    return OxtsRow(values[OXTS_GYRO], values[OXTS_ACCEL], float(values[OXTS_FORWARD_SPEED]))
+    values = np.array(finite_numbers(path, line, "oxts_malformed", cells))
+    speed = float(values[OXTS_FORWARD_SPEED])
+    return OxtsRow(values[OXTS_GYRO], values[OXTS_ACCEL], speed, values[OXTS_PLACE])
 
 
-def _floats(path: Path, line: int, code: str, cells: list[str]) -> list[float]:
+def finite_numbers(path: Path, line: int, code: str, cells: list[str]) -> list[float]:
+    """Numbers of a line.
+
+    Raises:
+        DatasetError: ``code``: a cell that is no finite number.
+    """
     values = []
     for cell in cells:
         try:
@@ -132,6 +150,46 @@ def read_oxts_file(path: Path) -> OxtsRow:
     return parse_oxts(path, lines[0].number, lines[0].text)
 
 
+def read_oxts_folder(folder: Path, span: tuple[int, int] | None = None) -> tuple[Int64Array, list[OxtsRow]]:
+    """``oxts/``: stamps [N], in the order of the records, and the records.
+
+    Args:
+        folder: holds ``timestamps.txt`` and ``data/``.
+        span: (first, last) nanoseconds: only the records from the first to the last that lie inside, so that disorder
+            among them stays; None: all.
+
+    Raises:
+        DatasetError: ``oxts_malformed`` (also without any record), ``timestamps_malformed``, ``timestamps_missing``,
+            ``file_name_malformed``, ``file_missing``, ``text_not_utf8``.
+    """
+    stamps = read_stamps(folder / "timestamps.txt")
+    files = numbered_files(folder / "data", (".txt",))
+    if span is not None:
+        inside = [number for number in files if number in stamps and span[0] <= stamps[number] <= span[1]]
+        files = {number: file for number, file in files.items() if inside and inside[0] <= number <= inside[-1]}
+    if not files:
+        when = "" if span is None else f" between {span[0]} and {span[1]} ns"
+        raise DatasetError(f"{folder / 'data'}: expected at least one record{when}, found none", code="oxts_malformed")
+    numbers = np.array([stamp_of(folder / "timestamps.txt", stamps, number) for number in files], dtype=np.int64)
+    return numbers, [read_oxts_file(file) for file in files.values()]
+
+
+def oxts_imu(imu_stamps: Int64Array, rows: Sequence[OxtsRow]) -> ImuLog:
+    """The records as a raw IMU log, with whatever disorder their stamps have."""
+    return ImuLog(imu_stamps, np.array([row.gyro_rad_s for row in rows]), np.array([row.accel_m_s2 for row in rows]))
+
+
+def forward_speeds(stamps: Int64Array, imu_stamps: Int64Array, rows: Sequence[OxtsRow]) -> Float64Array:
+    """[F, 1] forward speed in m/s of the record closest in time to each frame."""
+    order = np.argsort(imu_stamps, kind="stable")
+    times = imu_stamps[order]
+    right = np.searchsorted(times, stamps).clip(1, max(times.size - 1, 1))
+    left = right - 1
+    right = right.clip(0, times.size - 1)
+    nearest = np.where(stamps - times[left] <= times[right] - stamps, left, right)
+    return np.array([[rows[k].forward_speed_m_s] for k in order[nearest]])
+
+
 def read_calibration(
     path: Path, sizes: Mapping[str, int], *, names: Sequence[str] | None = None
 ) -> dict[str, Float64Array]:
@@ -152,7 +210,7 @@ def read_calibration(
             key, rest = (names[index] if index < len(names) else ""), line.text
         if key not in sizes:
             continue
-        numbers = _floats(path, line.number, "calibration_malformed", rest.split())
+        numbers = finite_numbers(path, line.number, "calibration_malformed", rest.split())
         if len(numbers) != sizes[key]:
             problem = f"{key}: expected {sizes[key]} numbers, found {len(numbers)}"
             raise malformed(path, line.number, "calibration_malformed", problem)

@@ -8,6 +8,7 @@ sequences/01/
   calib.txt                        optional: P0: ... P3: and Tr:; or calib_*.txt with unnamed lines in that order
   calib_imu_to_velo.txt            optional
   oxts*.txt                        optional: one OXTS record a line and frame, for the forward speed
+poses/01.txt                       optional: 12 numbers a line and frame, T_world_cam0; or one other file 01*.txt
 ```
 
 The samples of ``imu_<n>perframe*.csv`` carry no stamps. Sample n * i belongs to frame i (it agrees with OXTS record i
@@ -18,13 +19,15 @@ so a file for F frames has n * (F - 1) + 1 rows.
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from viflow_anomaly.config import ImageLimits
-from viflow_anomaly.datasets.kitti_calibration import read_odometry_camera
+from viflow_anomaly.datasets.kitti_calibration import read_odometry_camera, read_odometry_shift
 from viflow_anomaly.datasets.kitti_files import (
+    SPEED_NAMES,
     first_image_size,
     numbered_files,
     parse_oxts,
@@ -32,9 +35,11 @@ from viflow_anomaly.datasets.kitti_files import (
     read_stamps,
     stamp_of,
 )
+from viflow_anomaly.datasets.kitti_poses import read_odometry_trajectory
 from viflow_anomaly.datasets.plain import read_imu
 from viflow_anomaly.datasets.recording import FileRecording
 from viflow_anomaly.datasets.tables import check_increasing, parse_numbers, read_csv, read_lines
+from viflow_anomaly.datasets.trajectory import Trajectory
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.imu_log import ImuLog
 from viflow_anomaly.sensor_data import Float64Array, Int64Array
@@ -77,6 +82,7 @@ def open_kitti_odometry(root: Path, *, camera: str | None, limits: ImageLimits) 
     frame_stamps = np.array([stamp_of(stamps_file, stamps, number) for number in images], dtype=np.int64)
     check_increasing(stamps_file, frame_stamps.tolist(), [number + 1 for number in images])
     per_frame = _per_frame_file(root)
+    speeds = _read_speeds(root, list(images))
     every_stamp = np.array([stamps[number] for number in sorted(stamps)], dtype=np.int64)
     return FileRecording(
         name=root.resolve().name,
@@ -86,9 +92,16 @@ def open_kitti_odometry(root: Path, *, camera: str | None, limits: ImageLimits) 
         imu=read_imu(root / "imu.csv") if per_frame is None else _read_per_frame(per_frame, every_stamp),
         frame_timestamps_ns=frame_stamps,
         frame_paths=tuple(images.values()),
-        motor_commands=_read_speeds(root, list(images)),
+        motor_commands=speeds,
+        motor_names=() if speeds is None else SPEED_NAMES,
         limits=limits,
+        read_trajectory=partial(_read_trajectory, root, chosen[-1], every_stamp),
     )
+
+
+def _read_trajectory(root: Path, number: str, stamps: Int64Array) -> Trajectory | None:
+    T_cam_cam0 = read_odometry_shift(root, number)
+    return None if T_cam_cam0 is None else read_odometry_trajectory(root, stamps, T_cam_cam0)
 
 
 def _cameras(root: Path) -> list[str]:

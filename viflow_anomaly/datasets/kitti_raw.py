@@ -16,29 +16,34 @@ disorder: they are kept as they are and reported for the pairs that they touch.
 
 The images of ``_sync`` are rectified (``P_rect_0x``); those of ``_extract`` are not (``K_0x``, ``D_0x``). Which one
 applies is told by the image size, because folders get renamed.
+
+The trajectory comes from the OXTS places, with the mounting; without calibration there is none.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from viflow_anomaly.config import ImageLimits
-from viflow_anomaly.datasets.kitti_calibration import read_raw_camera
+from viflow_anomaly.datasets.kitti_calibration import CalibrationFiles, read_raw_camera
 from viflow_anomaly.datasets.kitti_files import (
-    OxtsRow,
+    SPEED_NAMES,
     first_image_size,
+    forward_speeds,
     numbered_files,
-    read_oxts_file,
+    oxts_imu,
+    read_oxts_folder,
     read_stamps,
     stamp_of,
 )
+from viflow_anomaly.datasets.kitti_poses import oxts_trajectory
 from viflow_anomaly.datasets.recording import FileRecording
 from viflow_anomaly.datasets.tables import check_increasing
 from viflow_anomaly.errors import DatasetError
-from viflow_anomaly.imu_log import ImuLog
-from viflow_anomaly.sensor_data import Float64Array, Int64Array
+from viflow_anomaly.sensor_data import Int64Array
 
 NEEDS = "image_00..03/data/, oxts/data/ and oxts/timestamps.txt"
 CAMERAS = ("image_02", "image_00", "image_01", "image_03")
@@ -72,33 +77,28 @@ def open_kitti_raw(root: Path, *, camera: str | None, limits: ImageLimits) -> Fi
     images = numbered_files(root / chosen / "data", (".png", ".jpg"))
     if not images:
         raise DatasetError(f"{root / chosen / 'data'}: expected at least one image, found none", code="no_frames")
-    imu_stamps, rows = _read_oxts(root / "oxts")
+    imu_stamps, rows = read_oxts_folder(root / "oxts")
     stamps = _frame_stamps(root, chosen, list(images), imu_stamps)
-    gyro = np.array([row.gyro_rad_s for row in rows])
+    files = CalibrationFiles.of_date(root.resolve().parent)
+    calibration = read_raw_camera(files, chosen[-2:], first_image_size(images.values(), limits=limits))
+    T_cam_imu = None if calibration is None else calibration.T_cam_imu
     return FileRecording(
         name=root.resolve().name,
         root=root,
         format="kitti_raw",
-        camera=read_raw_camera(root.resolve().parent, chosen[-2:], first_image_size(images.values(), limits=limits)),
-        imu=ImuLog(imu_stamps, gyro, np.array([row.accel_m_s2 for row in rows])),
+        camera=calibration,
+        imu=oxts_imu(imu_stamps, rows),
         frame_timestamps_ns=stamps,
         frame_paths=tuple(images.values()),
-        motor_commands=_speeds(stamps, imu_stamps, rows),
+        motor_commands=forward_speeds(stamps, imu_stamps, rows),
+        motor_names=SPEED_NAMES,
         limits=limits,
+        read_trajectory=partial(oxts_trajectory, imu_stamps, rows, T_cam_imu, str(root / "oxts")),
     )
 
 
 def _cameras(root: Path) -> list[str]:
     return [name for name in CAMERAS if (root / name / "data").is_dir()]
-
-
-def _read_oxts(folder: Path) -> tuple[Int64Array, list[OxtsRow]]:
-    stamps = read_stamps(folder / "timestamps.txt")
-    files = numbered_files(folder / "data", (".txt",))
-    if not files:
-        raise DatasetError(f"{folder / 'data'}: expected at least one record, found none", code="oxts_malformed")
-    numbers = np.array([stamp_of(folder / "timestamps.txt", stamps, number) for number in files], dtype=np.int64)
-    return numbers, [read_oxts_file(file) for file in files.values()]
 
 
 def _frame_stamps(root: Path, camera: str, numbers: list[int], imu_stamps: Int64Array) -> Int64Array:
@@ -115,14 +115,3 @@ def _frame_stamps(root: Path, camera: str, numbers: list[int], imu_stamps: Int64
     chosen = [stamp_of(path, stamps, number) for number in numbers]
     check_increasing(path, chosen, [number + 1 for number in numbers])
     return np.array(chosen, dtype=np.int64)
-
-
-def _speeds(stamps: Int64Array, imu_stamps: Int64Array, rows: list[OxtsRow]) -> Float64Array:
-    """[F, 1] forward speed of the record closest in time to each frame."""
-    order = np.argsort(imu_stamps, kind="stable")
-    times = imu_stamps[order]
-    right = np.searchsorted(times, stamps).clip(1, max(times.size - 1, 1))
-    left = right - 1
-    right = right.clip(0, times.size - 1)
-    nearest = np.where(stamps - times[left] <= times[right] - stamps, left, right)
-    return np.array([[rows[k].forward_speed_m_s] for k in order[nearest]])

@@ -70,6 +70,11 @@ class Recording(Protocol):
         ...
 
     @property
+    def motor_names(self) -> tuple[str, ...]:
+        """M names of the numbers of ``motor_command``, with their units; empty where the recording has none."""
+        ...
+
+    @property
     def trajectory(self) -> Trajectory | None:
         """Where the camera was, or None where the recording does not say.
 
@@ -88,6 +93,7 @@ class FileRecording:
         frame_timestamps_ns: [F] int64, strictly increasing.
         frame_paths: F image files.
         motor_commands: [F, M] or None.
+        motor_names: M names of its columns; empty without.
         limits: on every image that is decoded.
         read_trajectory: reads the poses of the camera when they are first asked for; None: there are none.
 
@@ -103,6 +109,7 @@ class FileRecording:
     frame_timestamps_ns: Int64Array
     frame_paths: tuple[Path, ...]
     motor_commands: Float64Array | None = None
+    motor_names: tuple[str, ...] = ()
     limits: ImageLimits = field(default_factory=ImageLimits)
     read_trajectory: Callable[[], Trajectory | None] | None = None
 
@@ -111,6 +118,8 @@ class FileRecording:
             raise DatasetError(f"{self.root}: expected at least one frame, found none", code="no_frames")
         assert len(self.frame_paths) == self.frame_timestamps_ns.size
         assert (np.diff(self.frame_timestamps_ns) > 0).all()
+        columns = 0 if self.motor_commands is None else self.motor_commands.shape[1]
+        assert columns == len(self.motor_names)
         assert self.motor_commands is None or len(self.motor_commands) == len(self.frame_paths)
 
     def __len__(self) -> int:
