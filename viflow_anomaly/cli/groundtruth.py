@@ -14,6 +14,7 @@ from viflow_anomaly.cli.progress import stderr_progress
 
 if TYPE_CHECKING:
     from viflow_anomaly.ground_truth.euroc_room import RoomSummary
+    from viflow_anomaly.ground_truth.kitti_lidar import LidarSummary
 
 Out = Annotated[
     Path | None,
@@ -87,7 +88,58 @@ def _say_room(summary: RoomSummary) -> None:
         print(f"depth is known for {summary.known_share:.1%} of the pixels")
 
 
+def kitti(
+    drive: Annotated[Path, typer.Argument(metavar="DRIVE", help="A KITTI raw drive with velodyne_points.")],
+    as_json: AsJson = False,
+    out: Out = None,
+    camera: Camera = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write sparse static flow from LiDAR scans and OXTS poses, without the points in boxes of what may move.
+
+    Frames without a scan are left out. In frames without labels points on moving things stay in; the answer says how
+    many frames these are.
+
+    [bold]Examples[/bold]
+
+      viflow-anomaly groundtruth kitti 2011_09_26/2011_09_26_drive_0005_sync --out runs/truth/0005
+    """
+    import cv2
+
+    from viflow_anomaly.ground_truth.kitti_lidar import render_lidar
+
+    cv2.setNumThreads(1)
+    with stderr_progress() as progress:
+        task = progress.add_task("scans", total=None)
+        summary = render_lidar(
+            drive,
+            out=out,
+            camera=camera,
+            overwrite=overwrite,
+            on_progress=lambda done, total: progress.update(task, completed=done, total=total),
+        )
+    if as_json:
+        print(json.dumps(asdict(summary) | {"folder": str(summary.folder)}, indent=2))
+    else:
+        _say_lidar(summary)
+
+
+def _say_lidar(summary: LidarSummary) -> None:
+    print(
+        f"{summary.frames} frames, {summary.with_scan} with a scan: {summary.written} written, {summary.kept} were "
+        f"there; {summary.with_flow} with flow to the next frame -> {summary.folder}"
+    )
+    if summary.written:
+        print(
+            f"points: {summary.static_points} kept, {summary.hidden_points} hidden, {summary.points_in_boxes} left out "
+            "in boxes of what may move"
+        )
+    if summary.without_labels:
+        print(f"{summary.without_labels} frames have no labels: points on moving things are kept there")
+
+
 def register(app: typer.Typer) -> None:
     commands = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
     commands.command(no_args_is_help=True)(euroc)
+    commands.command(no_args_is_help=True)(kitti)
     app.add_typer(commands, name="groundtruth", help="Make static flow for a recording: EuRoC's rooms, KITTI's LiDAR.")

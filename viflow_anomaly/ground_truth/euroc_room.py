@@ -7,20 +7,16 @@ to where its points are in the frame at t1. (The paper writes H the other way ro
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from viflow_anomaly.config import ImageLimits
 from viflow_anomaly.datasets import euroc
-from viflow_anomaly.datasets.camera_json import camera_to_mapping
 from viflow_anomaly.datasets.recording import FileRecording
 from viflow_anomaly.datasets.registry import open_recording
 from viflow_anomaly.errors import DatasetError
@@ -29,12 +25,10 @@ from viflow_anomaly.ground_truth.frame_poses import poses_of_frames, read_trajec
 from viflow_anomaly.ground_truth.ply import read_ply_points
 from viflow_anomaly.ground_truth.point_cloud import PointCloud, make_point_cloud
 from viflow_anomaly.ground_truth.range_image import render_depth
-from viflow_anomaly.ground_truth.truth_folder import FrameTruth, TruthFolder
+from viflow_anomaly.ground_truth.truth_folder import FrameTruth, TruthFolder, fingerprint, record_head, require_camera
 from viflow_anomaly.sensor_data import Float64Array, PinholeCamera
 
 Float32Array = NDArray[np.float32]
-RENDERING_VERSION = 1
-"""Raised when the same files give other pictures."""
 
 
 @dataclass(frozen=True)
@@ -95,34 +89,6 @@ def render_room(
     folder = TruthFolder(out or recording.root, record, poses, overwrite=overwrite)
     renderer = _Renderer(lens, make_point_cloud(points, T_world_cloud), poses)
     return _render_frames(folder, renderer, stamps, on_progress)
-
-
-def require_camera(recording: FileRecording) -> PinholeCamera:
-    """The recording's camera.
-
-    Raises:
-        DatasetError: ``camera_missing``.
-    """
-    if recording.camera is None:
-        raise DatasetError(
-            f"{recording.root}: expected a calibrated camera, found no calibration", code="camera_missing"
-        )
-    return recording.camera
-
-
-def record_head(name: str, camera: PinholeCamera) -> dict[str, Any]:
-    """The beginning of every ``ground_truth.json``."""
-    return {
-        "made_by": f"viflow-anomaly {version('viflow-anomaly')}, rendering {RENDERING_VERSION}",
-        "recording": name,
-        "camera": camera_to_mapping(camera),
-    }
-
-
-def fingerprint(path: Path) -> dict[str, str]:
-    """A file's name and checksum."""
-    with path.open("rb") as file:
-        return {"file": path.name, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
 
 
 def _poses(recording: FileRecording, trajectory: Path | None, stamps: list[int]) -> dict[int, Float64Array]:

@@ -12,9 +12,11 @@ groundtruth0/
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +24,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viflow_anomaly.checkpoint_record import write_atomically
+from viflow_anomaly.datasets.camera_json import camera_to_mapping
 from viflow_anomaly.datasets.ground_truth_png import write_depth_png, write_flow_png, write_mask_png
+from viflow_anomaly.datasets.recording import FileRecording
 from viflow_anomaly.datasets.simulated_ground_truth import POSES_NAME, RECORD_NAME
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.ground_truth.frame_poses import quaternion_of
-from viflow_anomaly.sensor_data import Float64Array
+from viflow_anomaly.sensor_data import Float64Array, PinholeCamera
 
 Float32Array = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 
 FOLDER_NAME = "groundtruth0"
 PICTURES = ("depth", "static_flow", "occluded")
+RENDERING_VERSION = 1
+"""Raised when the same files give other pictures."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,3 +120,31 @@ def _poses_text(poses: Mapping[int, Float64Array]) -> str:
         numbers = [*pose[:3, 3], *quaternion_of(pose[:3, :3])]
         lines.append(",".join([str(stamp), *(repr(float(number)) for number in numbers)]))
     return "\n".join(lines) + "\n"
+
+
+def require_camera(recording: FileRecording) -> PinholeCamera:
+    """The recording's camera.
+
+    Raises:
+        DatasetError: ``camera_missing``.
+    """
+    if recording.camera is None:
+        raise DatasetError(
+            f"{recording.root}: expected a calibrated camera, found no calibration", code="camera_missing"
+        )
+    return recording.camera
+
+
+def record_head(name: str, camera: PinholeCamera) -> dict[str, Any]:
+    """The beginning of every ``ground_truth.json``."""
+    return {
+        "made_by": f"viflow-anomaly {version('viflow-anomaly')}, rendering {RENDERING_VERSION}",
+        "recording": name,
+        "camera": camera_to_mapping(camera),
+    }
+
+
+def fingerprint(path: Path) -> dict[str, str]:
+    """A file's name and checksum."""
+    with path.open("rb") as file:
+        return {"file": path.name, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
