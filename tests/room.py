@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from worlds import make_world, write_euroc, write_lines
 
+from viflow_anomaly.datasets.euroc import read_T_body_cam
 from viflow_anomaly.geometry import pixel_grid, so3_exp, unproject_pixels
+from viflow_anomaly.ground_truth.frame_poses import quaternion_of
 from viflow_anomaly.sensor_data import PinholeCamera
 
 Float64Array = NDArray[np.float64]
@@ -80,3 +85,43 @@ def write_ply(path: Path, points: NDArray[np.float32], *, order: str = "binary_l
     if order == "ascii":
         data = "".join(" ".join(map(str, row)) + "\n" for row in rows.tolist()).encode()
     path.write_bytes("\n".join(header).encode() + data)
+
+
+def room_flow(
+    camera: PinholeCamera, T_world_source: Float64Array, T_world_target: Float64Array
+) -> tuple[Float64Array, Float64Array]:
+    """Where the room's points go, in closed form and without the library's flow: flow [H, W, 2] px, depth [H, W] m that
+    they have in the target."""
+    pixels = pixel_grid(camera.height, camera.width).astype(np.float64)
+    rays = np.concatenate([unproject_pixels(camera, pixels), np.ones((*pixels.shape[:2], 1))], axis=-1)
+    points = rays * room_depth(camera, T_world_source)[..., None]
+    world = points @ T_world_source[:3, :3].T + T_world_source[:3, 3]
+    there = (world - T_world_target[:3, 3]) @ T_world_target[:3, :3]
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+    zero = np.zeros(3)
+    there = np.where(there[..., 2:] > 0.01, there, (0.0, 0.0, 1.0))
+    found, _ = cv2.projectPoints(there.reshape(-1, 3), zero, zero, K, np.array(camera.distortion_coeffs))
+    return found.reshape(pixels.shape) - pixels, there[..., 2]
+
+
+def write_room_recording(
+    folder: Path, camera: PinholeCamera, poses: list[Float64Array], points: NDArray[np.float32]
+) -> Path:
+    """A recording in EuRoC layout with the cloud and a state at every frame; the pictures show nothing of the room."""
+    world = make_world(frames=len(poses), width=camera.width, height=camera.height)
+    write_euroc(folder, replace(world, camera=replace(camera, T_cam_imu=world.camera.T_cam_imu)))
+    write_states(folder / "mav0", poses, world.frame_timestamps_ns.tolist())
+    write_ply(folder / "mav0" / "pointcloud0" / "data.ply", points)
+    return folder
+
+
+def write_states(mav0: Path, poses: list[Float64Array], stamps: list[int]) -> None:
+    """``state_groundtruth_estimate0/data.csv`` of camera poses."""
+    T_body_cam = read_T_body_cam(mav0 / "cam0" / "sensor.yaml")
+    assert T_body_cam is not None
+    lines = ["#timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z"]
+    for stamp, T_world_cam in zip(stamps, poses, strict=True):
+        body = T_world_cam @ np.linalg.inv(T_body_cam)
+        numbers = [*body[:3, 3], *quaternion_of(body[:3, :3])]
+        lines.append(",".join([str(stamp), *(repr(float(number)) for number in numbers)]))
+    write_lines(mav0 / "state_groundtruth_estimate0" / "data.csv", lines)

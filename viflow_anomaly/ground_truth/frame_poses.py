@@ -13,7 +13,6 @@ from viflow_anomaly.datasets.euroc import read_T_body_cam, read_trajectory
 from viflow_anomaly.datasets.tables import csv_malformed, parse_numbers, read_lines
 from viflow_anomaly.datasets.trajectory import Trajectory, rigid, rotations_of
 from viflow_anomaly.errors import DatasetError
-from viflow_anomaly.geometry import so3_log
 from viflow_anomaly.sensor_data import MAX_TIMESTAMP_NS, Float64Array, Int64Array
 
 MAX_STAMP_DIFFERENCE_NS = 1_000_000
@@ -100,7 +99,15 @@ def poses_of_frames(trajectory: Trajectory, stamps_ns: Sequence[int]) -> dict[in
 
 
 def quaternion_of(rotation: Float64Array) -> Float64Array:
-    """Rotation matrix [3, 3] -> quaternion w x y z."""
-    vector = so3_log(rotation)
-    angle = float(np.linalg.norm(vector))
-    return np.array([np.cos(angle / 2), *(vector * (np.sinc(angle / (2 * np.pi)) / 2))])
+    """Rotation matrix [3, 3] -> quaternion w x y z: the first eigenvector of Horn's matrix (JOSA A 1987)."""
+    R = rotation
+    horn = np.array(
+        [
+            [R[0, 0] + R[1, 1] + R[2, 2], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
+            [0.0, R[0, 0] - R[1, 1] - R[2, 2], R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]],
+            [0.0, 0.0, R[1, 1] - R[0, 0] - R[2, 2], R[1, 2] + R[2, 1]],
+            [0.0, 0.0, 0.0, R[2, 2] - R[0, 0] - R[1, 1]],
+        ]
+    )
+    quaternion = np.linalg.eigh(horn, UPLO="U").eigenvectors[:, -1]
+    return np.asarray(quaternion if quaternion[0] >= 0 else -quaternion)

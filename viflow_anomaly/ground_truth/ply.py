@@ -170,8 +170,8 @@ def _read_ascii(path: Path, file: BinaryIO, elements: list[_Element]) -> Float32
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # numpy warns where the data end early; the count below says so better
         try:
-            text = io.TextIOWrapper(file, encoding="ascii")
-            points = np.loadtxt(text, dtype=np.float32, usecols=columns, max_rows=vertex.count, comments=None, ndmin=2)
+            lines = (line.decode("ascii") for line in file)
+            points = np.loadtxt(lines, dtype=np.float32, usecols=columns, max_rows=vertex.count, comments=None, ndmin=2)
         except ValueError as err:
             raise _malformed(path, f"expected {vertex.count} lines of {' '.join(names)}, found {err}") from err
     if len(points) != vertex.count:
