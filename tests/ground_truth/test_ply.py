@@ -33,9 +33,7 @@ def test_properties_are_found_by_name_and_other_elements_skipped(tmp_path: Path)
 
 
 def test_binary_elements_before_the_points_are_skipped(tmp_path: Path) -> None:
-    head = (
-        "ply\nformat binary_little_endian 1.0\nelement camera 2\nproperty short a\nproperty uchar b\n"
-    )
+    head = "ply\nformat binary_little_endian 1.0\nelement camera 2\nproperty short a\nproperty uchar b\n"
     head += "element vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
     (tmp_path / "data.ply").write_bytes(head.encode() + b"\xff" * 6 + POINTS[0].astype("<f4").tobytes())
     np.testing.assert_array_equal(read_ply_points(tmp_path / "data.ply"), POINTS[:1])
