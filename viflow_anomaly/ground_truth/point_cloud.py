@@ -15,7 +15,9 @@ CELL_M = 0.1
 """Side of the cells in which points are counted: large against the spacing (about 1 cm), small against furniture."""
 
 MAX_SPACING_RATIO = 5.0
-"""Points that lie this much sparser than most are stray returns between scanner and wall, not a surface."""
+STRAY_SPACING_M = 0.05
+"""Points that lie this much sparser than most, and farther apart than this (under four in a cell), are stray returns
+between scanner and wall, not a surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +46,7 @@ def make_point_cloud(points_m: Float32Array, T_world_cloud: Float64Array | None 
     if T_world_cloud is not None and not np.array_equal(T_world_cloud, np.eye(4)):
         points = (points_m @ T_world_cloud[:3, :3].T + T_world_cloud[:3, 3]).astype(np.float32)
     spacing = np.minimum(_spacing(points, 0.0), _spacing(points, CELL_M / 2))
-    kept = spacing <= MAX_SPACING_RATIO * np.median(spacing)
+    kept = spacing <= max(MAX_SPACING_RATIO * float(np.median(spacing)), STRAY_SPACING_M)
     return PointCloud(points[kept], spacing[kept])
 
 
