@@ -30,7 +30,7 @@ from viflow_anomaly.errors import ViflowError
 
 def measure(detector: AnomalyDetector, path: Path) -> dict[str, Any]:
     """One recording's row; a pair that fails is counted by the code of its error."""
-    pairs = RecordingPairs(open_recording(path))
+    pairs = RecordingPairs(open_recording(path), motor_source=detector.motor_source)
     residuals, identities = [], []
     counts = {"ok": 0, "abstained": 0, "independent_motion": 0, "model_error": 0}
     failed: dict[str, int] = {}

@@ -17,6 +17,7 @@ from viflow_anomaly.datasets.camera_json import camera_from_mapping
 from viflow_anomaly.detection import to_json
 from viflow_anomaly.errors import InvalidInputError, TooLargeError, ViflowError
 from viflow_anomaly.images import decode_image
+from viflow_anomaly.motor_input import require_supported
 from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples
 from viflow_anomaly_service.detector_slot import PairDetector
 from viflow_anomaly_service.form_body import parse_form
@@ -82,6 +83,7 @@ def answer_request(detector: PairDetector, body: bytes, content_type: str, setti
     try:
         config = requested_config(received, detector.config)
         pair = frame_pair(received, settings)
+        require_supported(pair, detector.motor_source)
         decode_ms = (time.perf_counter() - started) * 1e3
         detection = detector.with_config(config).detect(pair, decode_ms=decode_ms)
     except ViflowError as err:
@@ -160,21 +162,13 @@ def frame_pair(received: ReceivedPair, settings: ServiceSettings) -> FramePair:
     rest = received.rest
     imu = _imu_samples(received.imu, settings.max_imu_samples)
     camera = None if rest.camera is None else camera_from_mapping(rest.camera, field="camera")
-    pair = FramePair(
+    return FramePair(
         source=_frame("source", received, settings),
         target=_frame("target", received, settings),
         imu=imu,
         camera=camera,
         motor_command=None if rest.motor_command is None else np.asarray(rest.motor_command, dtype=np.float64),
     )
-    if pair.motor_command is not None:
-        raise InvalidInputError(
-            f"motor_command: expected none, because this model takes no motor input, found {len(pair.motor_command)} "
-            "numbers",
-            code="motor_command_unsupported",
-            field="motor_command",
-        )
-    return pair
 
 
 def _frame(name: str, received: ReceivedPair, settings: ServiceSettings) -> Frame:

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable
 from typing import Any, Protocol, Self
 
-from viflow_anomaly.config import DetectorConfig
+from viflow_anomaly.config import DetectorConfig, MotorSource
 from viflow_anomaly.detection import Detection
 from viflow_anomaly.sensor_data import FramePair
 from viflow_anomaly_service.problems import Problem
@@ -36,6 +36,9 @@ class PairDetector(Protocol):
 
     @property
     def config(self) -> DetectorConfig: ...
+
+    @property
+    def motor_source(self) -> MotorSource | None: ...
 
     def with_config(self, config: DetectorConfig) -> Self: ...
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viflow_anomaly.config import DetectorConfig
+from viflow_anomaly.config import DetectorConfig, MotorSource
 from viflow_anomaly.detection import (
     AnalyzedRegion,
     Detection,
@@ -36,6 +36,7 @@ class DifferenceDetector:
     model_info: ModelInfo = field(default_factory=lambda: ModelInfo("difference", "1", "ab" * 32))
     on_pair: Callable[[FramePair], None] = lambda pair: None
     seen: list[int] = field(default_factory=list)
+    motor_source: MotorSource | None = None
 
     def detect(self, pair: FramePair, *, decode_ms: float = 0.0) -> Detection:
         return self.analyze(pair, decode_ms=decode_ms).detection

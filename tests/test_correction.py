@@ -86,9 +86,48 @@ def test_a_mover_is_outvoted_and_not_explained_away() -> None:
     flow[5:17, 10:26] += np.array((6.0, 3.0), dtype=np.float32)  # an eighth of the view
     measured = seen.measured._replace(flow_px=flow)
     start = RigidMotion(seen.true.rotation, np.zeros(3))
-    corrected = correct_motion(RAYS, seen.inverse_depth, start, measured, FOCAL_PX, CorrectionConfig(rounds=10))
+    config = CorrectionConfig(rounds=10, depth_rounds=0)
+    corrected = correct_motion(RAYS, seen.inverse_depth, start, measured, FOCAL_PX, config)
     assert error_px(corrected.flow_px, seen) < 0.1
     assert 0.8 < corrected.inlier_share < 0.9
+
+
+def test_a_mover_is_no_nearer_wall() -> None:
+    """Refining the depth leaves most of a motion that no depth explains, and the static world as it is."""
+    seen = sight()
+    flow = seen.measured.flow_px.copy()
+    flow[5:17, 10:26] += np.array((6.0, 3.0), dtype=np.float32)
+    measured = seen.measured._replace(flow_px=flow)
+    refined = correct_motion(RAYS, seen.inverse_depth, seen.true, measured, FOCAL_PX, CorrectionConfig())
+    left = np.linalg.norm(flow - refined.flow_px, axis=-1)
+    assert left[5:17, 10:26].mean() > 0.5 * np.hypot(6, 3)
+    still_world = np.ones((ROWS, COLUMNS), bool)
+    still_world[2:20, 7:29] = False
+    assert left[still_world].mean() < 0.05
+
+
+def test_a_depth_that_the_network_misread_is_found_in_the_parallax() -> None:
+    seen = sight()
+    misread = seen.inverse_depth.copy()
+    misread[:, COLUMNS // 2 :] *= 0.7
+    config = CorrectionConfig(rounds=1)
+    before, after = (
+        correct_motion(RAYS, misread, seen.true, seen.measured, FOCAL_PX, config.model_copy(update={"depth_rounds": n}))
+        for n in (0, 4)
+    )
+    assert before.motion is not None
+    assert error_px(after.flow_px, seen) < 0.3 * error_px(before.flow_px, seen)
+    assert after.inlier_share > before.inlier_share
+
+
+def test_without_translation_there_is_no_parallax_to_learn_a_depth_from() -> None:
+    seen = sight()
+    turned = RigidMotion(seen.true.rotation, np.zeros(3))
+    flow = rigid_flow_px(RAYS, seen.inverse_depth, turned, FOCAL_PX)
+    measured = seen.measured._replace(flow_px=flow + np.float32(0.3))
+    corrected = correct_motion(RAYS, seen.inverse_depth, turned, measured, FOCAL_PX, CorrectionConfig(rounds=1))
+    assert np.isfinite(corrected.flow_px).all()
+    assert np.abs(corrected.flow_px - flow).max() < 0.5
 
 
 def test_the_prior_holds_where_the_measurement_says_nothing() -> None:

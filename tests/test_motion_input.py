@@ -172,6 +172,13 @@ class TestPaperLayouts:
         jittered = build_motion_window(make_pair(times_s + jitter_s, lambda _: values, interval_s=interval_s), config)
         np.testing.assert_array_equal(jittered.values, exact.values)
 
+    @pytest.mark.parametrize("rate_hz", [93, 97, 102, 108])
+    def test_an_imu_that_is_not_quite_as_fast_as_the_paper_says(self, rate_hz: float) -> None:
+        times_s = regular(rate_hz)
+        window = build_motion_window(make_pair(times_s, swinging, interval_s=10 / rate_hz), KITTI)
+        first = int(np.flatnonzero(times_s > -1e-3)[0]) - 10
+        np.testing.assert_allclose(window.values, swinging(times_s)[first : first + 20], rtol=1e-6)
+
     @pytest.mark.parametrize("missing_s", [-0.03, 0.0, 0.02])
     def test_a_missing_sample_is_named(self, missing_s: float) -> None:
         times_s = regular(200)

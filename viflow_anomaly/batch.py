@@ -22,6 +22,7 @@ class Batch(NamedTuple):
         source, target: [B, 1, H, W] in 0..1.
         motion: [B, T, 6] in rad/s and m/s^2.
         interval_s: [B].
+        motor: [B, M], None for networks without a motor stream.
         measured: what the images say of their flow, one for each example (training of preset ``calibrated`` only).
     """
 
@@ -29,6 +30,7 @@ class Batch(NamedTuple):
     target: torch.Tensor
     motion: torch.Tensor
     interval_s: torch.Tensor
+    motor: torch.Tensor | None = None
     measured: tuple[MeasuredFlow, ...] = ()
 
 
@@ -59,7 +61,8 @@ def collate(inputs: Sequence[ModelInput], device: torch.device | str = "cpu") ->
         np.stack([one.target for one in inputs]),
         np.stack([one.window.values for one in inputs]),
         np.array([one.window.interval_s for one in inputs], dtype=np.float32),
-        device,
+        np.stack([one.motor for one in inputs if one.motor is not None]) if inputs[0].motor is not None else None,
+        device=device,
     )
 
 
@@ -68,9 +71,11 @@ def collate_arrays(
     target: Uint8Array,
     motion: Float32Array,
     interval_s: Float32Array,
+    motor: Float32Array | None = None,
+    *,
     device: torch.device | str = "cpu",
 ) -> Batch:
-    """source, target [B, H, W] uint8, motion [B, T, 6], interval_s [B] -> a batch on ``device``."""
+    """source, target [B, H, W] uint8, motion [B, T, 6], interval_s [B], motor [B, M] -> a batch on ``device``."""
 
     def images(array: Uint8Array) -> torch.Tensor:
         return torch.from_numpy(array).to(device).unsqueeze(1).float().div_(255.0)
@@ -80,4 +85,5 @@ def collate_arrays(
         target=images(target),
         motion=torch.from_numpy(motion).to(device),
         interval_s=torch.from_numpy(interval_s).to(device),
+        motor=None if motor is None else torch.from_numpy(motor).to(device),
     )

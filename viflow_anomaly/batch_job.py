@@ -33,7 +33,7 @@ from viflow_anomaly.batch_record import (
     describe_run,
     summarise,
 )
-from viflow_anomaly.config import DetectorConfig, FrozenConfig
+from viflow_anomaly.config import DetectorConfig, FrozenConfig, MotorSource
 from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.datasets.recording import Recording
 from viflow_anomaly.detection import Detection, ModelInfo, to_json
@@ -65,6 +65,9 @@ class PairDetector(Protocol):
     @property
     def config(self) -> DetectorConfig: ...
 
+    @property
+    def motor_source(self) -> MotorSource | None: ...
+
     def detect(self, pair: FramePair, *, decode_ms: float = 0.0) -> Detection: ...
 
     def analyze(self, pair: FramePair, *, decode_ms: float = 0.0) -> PairAnalysis: ...
@@ -92,13 +95,13 @@ def run_batch(
         on_progress: told after every pair.
 
     Raises:
-        DatasetError: ``recording_too_short``.
+        DatasetError: ``recording_too_short``, ``trajectory_missing`` for a model that wants displacements.
         InvalidInputError: ``output_not_empty``, ``output_in_use``, ``options_contradict``,
             ``resume_config_differs``, ``resume_recording_differs``, ``resume_run_unreadable``.
         OSError: the results cannot be written; what is done stays for a run with ``resume``.
     """
     started = time.monotonic()
-    pairs = RecordingPairs(recording, (options.look_ahead,))
+    pairs = RecordingPairs(recording, (options.look_ahead,), motor_source=detector.motor_source)
     count = min(len(pairs), options.limit or len(pairs))
     if not count:
         raise DatasetError(

@@ -115,13 +115,58 @@ class MotionWindowConfig(FrozenConfig):
         return fixed.get(self.layout, self.samples_before + self.samples_between)
 
 
+MotorSource = Literal["command", "displacement"]
+MotionInputs = Literal["imu", "sffms", "imu+sffms", "motor", "imu+motor"]
+
+
+class MotorConfig(FrozenConfig):
+    """How a displacement or a command becomes the numbers of the motor stream; see ``motor_input``.
+
+    ``sffms`` [Methods]: K-means over the training pairs' displacements, one-hot. ``motor``: the command's own numbers,
+    standardised. What is fitted stays empty until a training fits it, and is saved in the checkpoint.
+    """
+
+    clusters: int = Field(default=20, ge=1, le=1024)
+    centroids_m: tuple[tuple[float, float, float], ...] = Field(
+        default=(), description="fitted: displacements along the source camera's axes"
+    )
+    mean: tuple[float, ...] = Field(default=(), max_length=64, description="fitted: of the command's numbers")
+    deviation: tuple[PositiveFloat, ...] = Field(default=(), max_length=64, description="fitted, one for each mean")
+
+    @model_validator(mode="after")
+    def _fitted_as_a_whole(self) -> Self:
+        if self.centroids_m and len(self.centroids_m) != self.clusters:
+            raise ValueError(f"centroids_m: expected none or {self.clusters}, found {len(self.centroids_m)}")
+        if len(self.mean) != len(self.deviation):
+            raise ValueError(f"deviation: expected as many numbers as mean, {len(self.mean)}, found {self.deviation}")
+        return self
+
+
 class ModelConfig(FrozenConfig):
     """What the builder needs to make a network; saved in its checkpoint."""
 
     preset: Literal["paper", "compact", "calibrated"] = "calibrated"
     hypotheses: Literal[1, 4, 8] = 8
     view: ViewConfig = ViewConfig()
+    motion_inputs: MotionInputs = "imu"
     motion_window: MotionWindowConfig = MotionWindowConfig()
+    motor: MotorConfig = MotorConfig()
+
+    @property
+    def uses_imu(self) -> bool:
+        return "imu" in self.motion_inputs
+
+    @property
+    def motor_source(self) -> MotorSource | None:
+        """What ``FramePair.motor_command`` must hold for this model."""
+        if "sffms" in self.motion_inputs:
+            return "displacement"
+        return "command" if "motor" in self.motion_inputs else None
+
+    @property
+    def motor_numbers(self) -> int:
+        """How many numbers the network's motor stream takes; 0: it has none, or a command that is not fitted yet."""
+        return {"displacement": self.motor.clusters, "command": 2 * len(self.motor.mean), None: 0}[self.motor_source]
 
     @model_validator(mode="after")
     def _window_ends_with_the_interval(self) -> Self:
@@ -178,6 +223,7 @@ class CorrectionConfig(FrozenConfig):
 
     enabled: bool = True
     rounds: int = Field(default=4, ge=1, le=50)
+    depth_rounds: int = Field(default=2, ge=0, le=50, description="of the depth's refinement; 0: depth as predicted")
     tolerance_px: float = Field(
         default=0.7, ge=0.01, le=100, description="view pixels at which a cell's weight is halved"
     )

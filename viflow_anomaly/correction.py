@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from viflow_anomaly.config import CorrectionConfig
+from viflow_anomaly.depth_refinement import Parallax, log_depth_step
 from viflow_anomaly.geometry import Float32Array, so3_exp
 from viflow_anomaly.measured_flow import MeasuredFlow
 from viflow_anomaly.sensor_data import Float64Array
@@ -113,7 +114,36 @@ def correct_motion(
         motion = RigidMotion(so3_exp(step[:3]) @ motion.rotation, motion.translation + step[3:])
     before = rigid_flow_px(rays, inverse_depth, start, focal_px)
     after = rigid_flow_px(rays, inverse_depth, motion, focal_px)
-    return _accepted(before, after, measured, config, start, motion)
+    corrected = _accepted(before, after, measured, config, start, motion)
+    if not corrected.converged or not config.depth_rounds:
+        return corrected
+    refined = _refined_depth(rays, inverse_depth, motion, measured, focal_px, config)
+    flow_px = rigid_flow_px(rays, refined, motion, focal_px)
+    share, _ = _inlier_share(flow_px, measured, config)
+    return corrected._replace(
+        flow_px=flow_px, inlier_share=share, shift_px=_shift_px(before, flow_px, measured, config)
+    )
+
+
+def _refined_depth(
+    rays: Float32Array,
+    inverse_depth: Float32Array,
+    motion: RigidMotion,
+    measured: MeasuredFlow,
+    focal_px: float,
+    config: CorrectionConfig,
+) -> Float32Array:
+    """[h, w] inverse depth that explains the measured parallax better, see ``depth_refinement``."""
+    x, y = np.ascontiguousarray(rays[..., 0]), np.ascontiguousarray(rays[..., 1])
+    t = motion.translation.astype(np.float32)
+    goal = measured.flow_px / np.float32(focal_px) + rays
+    log_ratio = np.zeros_like(inverse_depth)
+    for _ in range(config.depth_rounds):
+        moved_x, moved_y, nearness = _moved(x, y, inverse_depth * np.exp(log_ratio), motion)
+        slope = np.stack([nearness * (t[0] - moved_x * t[2]), nearness * (t[1] - moved_y * t[2])], axis=-1)
+        parallax = Parallax(goal - np.stack([moved_x, moved_y], axis=-1), slope)
+        log_ratio = log_depth_step(parallax, measured, log_ratio, config.tolerance_px / focal_px)
+    return np.asarray(inverse_depth * np.exp(log_ratio), dtype=np.float32)
 
 
 def _fill_jacobian(jacobian: Float32Array, x: Float32Array, y: Float32Array, nearness: Float32Array) -> None:
@@ -219,19 +249,24 @@ def _accepted(
     motion: RigidMotion | None,
 ) -> Correction:
     """Take the correction where it explains the measurement better than the prediction did."""
+    (share, enough), (share_before, _) = (_inlier_share(flow, measured, config) for flow in (after, before))
+    converged = enough and share >= share_before and bool(np.isfinite(after[_lattice(measured, config)]).all())
+    if not converged:
+        return Correction(before, start, share_before, 0.0, converged=False)
+    return Correction(after, motion, share, _shift_px(before, after, measured, config), converged=True)
+
+
+def _inlier_share(flow_px: Float32Array, measured: MeasuredFlow, config: CorrectionConfig) -> tuple[float, bool]:
+    """Which share of the measurement agrees with a flow, and whether enough was measured to say so."""
     thin = _lattice(measured, config)
     confidence = measured.confidence[thin]
     total = float(confidence.sum())
-    enough = config.min_confidence * confidence.size
+    if total <= config.min_confidence * confidence.size:
+        return 0.0, False
+    error = (measured.flow_px[thin] - flow_px[thin]).reshape(-1, 2).T
+    return float(robust_weights(error, confidence.reshape(-1), config.tolerance_px).sum()) / total, True
 
-    def inliers(flow: Float32Array) -> float:
-        error = (measured.flow_px[thin] - flow[thin]).reshape(-1, 2).T
-        weights = robust_weights(error, confidence.reshape(-1), config.tolerance_px)
-        return float(weights.sum()) / total if total > enough else 0.0
 
-    share, share_before = inliers(after), inliers(before)
-    converged = total > enough and share >= share_before and bool(np.isfinite(after[thin]).all())
-    if not converged:
-        return Correction(before, start, share_before, 0.0, converged=False)
-    shift = float(np.abs(after[thin] - before[thin]).sum(axis=-1).mean())
-    return Correction(after, motion, share, shift, converged=True)
+def _shift_px(before: Float32Array, after: Float32Array, measured: MeasuredFlow, config: CorrectionConfig) -> float:
+    thin = _lattice(measured, config)
+    return float(np.abs(after[thin] - before[thin]).sum(axis=-1).mean())

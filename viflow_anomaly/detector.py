@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viflow_anomaly.checkpoint_record import CheckpointRecord
-from viflow_anomaly.config import CorrectionConfig, DetectorConfig, RuntimeName
+from viflow_anomaly.config import CorrectionConfig, DetectorConfig, MotorSource, RuntimeName
 from viflow_anomaly.correction import Correction
 from viflow_anomaly.detection import (
     AnalyzedRegion,
@@ -118,6 +118,11 @@ class AnomalyDetector:
     def runtime(self) -> str:
         """The backend that runs the network: ``torch`` or ``openvino``."""
         return self._runtime.name
+
+    @property
+    def motor_source(self) -> MotorSource | None:
+        """What the pairs' ``motor_command`` must hold; None: the model has no motor stream and looks at none."""
+        return self._record.model.motor_source
 
     def with_config(self, config: DetectorConfig) -> AnomalyDetector:
         """The same weights under another configuration; nothing is loaded or copied."""

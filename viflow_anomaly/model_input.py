@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from viflow_anomaly.config import ModelConfig
+from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.motion_input import MotionWindow, build_motion_window
+from viflow_anomaly.motor_input import motor_input
 from viflow_anomaly.sensor_data import FramePair, Uint8Array
 from viflow_anomaly.view import InternalView, make_view
 
@@ -18,21 +20,24 @@ class ModelInput:
         source, target: [h, w] uint8 views.
         window: its ``values`` are [T, 6].
         view: how the views came from the source image.
+        motor: [M] for the network's motor stream, None where it has none.
     """
 
     source: Uint8Array
     target: Uint8Array
     window: MotionWindow
     view: InternalView
+    motor: Float32Array | None = None
 
 
 def prepare(pair: FramePair, config: ModelConfig) -> ModelInput:
     """Render the views of a pair and build its motion window.
 
     Raises:
-        InvalidInputError: as ``make_view`` and ``build_motion_window``.
+        InvalidInputError: as ``make_view``, ``build_motion_window`` and ``motor_input``.
     """
     height, width = pair.source.image.shape
     view = make_view(config.view, width=width, height=height, camera=pair.camera)
     window = build_motion_window(pair, config.motion_window)
-    return ModelInput(view.render(pair.source.image), view.render(pair.target.image), window, view)
+    motor = motor_input(pair, config)
+    return ModelInput(view.render(pair.source.image), view.render(pair.target.image), window, view, motor)

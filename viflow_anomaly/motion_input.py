@@ -34,6 +34,10 @@ GAP_INTERVALS = 2.0
 MIN_SAMPLES_IN_INTERVAL = 4
 MAX_INTERVAL_S = 1.0
 STAMP_JITTER_S = 0.001
+PAPER_RATE_TOLERANCE = 0.1
+PAPER_SPACINGS = (0.55, 1.55)
+"""How far an IMU's rate, and the spacing of two samples in its periods, may be from the layout's: KITTI's is 93 to
+102 Hz where the paper says 100, and stamps jitter by a millisecond."""
 
 
 class PaperBlocks(NamedTuple):
@@ -112,7 +116,9 @@ def _reach(interval_s: float, config: MotionWindowConfig) -> tuple[float, float]
     if blocks is None:
         return config.before_s, interval_s
     last_block_s = _look_ahead(interval_s, blocks) * blocks.block_s
-    return blocks.block_s, max(interval_s, last_block_s + blocks.block_s / blocks.rows_per_block)
+    slowest = 1 + PAPER_RATE_TOLERANCE
+    after_s = slowest * (last_block_s + blocks.block_s / blocks.rows_per_block)
+    return slowest * blocks.block_s, max(interval_s, after_s)
 
 
 def _touched_samples(pair: FramePair, start_s: float, end_s: float) -> _Signal:
@@ -238,29 +244,41 @@ def _integral_at(edges_s: Float64Array, signal: _Signal) -> Float64Array:
 def _paper_rows(signal: _Signal, interval_s: float, blocks: PaperBlocks) -> Float64Array:
     """[T, 6] raw rows, zero beyond the look-ahead; the sample at the source frame opens the first block after it.
 
-    That anchor is the first sample not more than 1 ms earlier than the frame. A block reaches from half a period
-    before its nominal start to half a period before its end, counted from the anchor, so that stamps may jitter by
-    nearly half a period (EuRoC's differ by 256 ns).
+    That anchor is the first sample not more than 1 ms earlier than the frame. Blocks are counted in samples from it, so
+    stamps may jitter (EuRoC's differ by 256 ns) and the rate may be a tenth off; a missing sample, or one too many,
+    shows in the spacing.
     """
     look_ahead = _look_ahead(interval_s, blocks)
     times_s = signal.times_s
-    anchor_s = times_s[np.searchsorted(times_s, -STAMP_JITTER_S)]
-    half_period_s = 0.5 * blocks.block_s / blocks.rows_per_block
-    bounds_s = anchor_s - half_period_s + blocks.block_s * np.arange(-1, look_ahead + 1)
-    bounds = np.searchsorted(times_s, bounds_s)
-    for block, count in enumerate(np.diff(bounds).tolist(), start=-1):
-        if count != blocks.rows_per_block:
-            raise InvalidInputError(
-                f"imu: expected {blocks.rows_per_block} samples in the {1e3 * blocks.block_s:.0f} ms that begin "
-                f"{1e3 * block * blocks.block_s:+.0f} ms from the source frame (the paper's layout of raw samples), "
-                f"found {count}",
-                code="imu_window_count",
-                field="imu.timestamps_ns",
-            )
+    anchor = int(np.searchsorted(times_s, -STAMP_JITTER_S))
+    first, end = anchor - blocks.rows_per_block, anchor + look_ahead * blocks.rows_per_block
+    spacings = np.diff(times_s[max(first, 0) : end]) * blocks.rows_per_block / blocks.block_s
+    whole = first >= 0 and end <= times_s.size
+    even = whole and PAPER_SPACINGS[0] < spacings.min() and spacings.max() < PAPER_SPACINGS[1]
+    if not even or abs(float(spacings.mean()) - 1) > PAPER_RATE_TOLERANCE:
+        raise _not_the_layout(times_s, anchor, look_ahead, blocks)
     rows = np.zeros((blocks.rows_per_block * (1 + blocks.max_look_ahead), 6))
-    taken = signal.values[bounds[0] : bounds[-1]]
-    rows[: len(taken)] = taken
+    rows[: end - first] = signal.values[first:end]
     return rows
+
+
+def _not_the_layout(times_s: Float64Array, anchor: int, look_ahead: int, blocks: PaperBlocks) -> InvalidInputError:
+    """Names the first block that holds another number of samples, counted in time from the anchor."""
+    anchor_s = float(times_s[min(anchor, times_s.size - 1)])
+    half_period_s = 0.5 * blocks.block_s / blocks.rows_per_block
+    counts = np.diff(
+        np.searchsorted(times_s, anchor_s - half_period_s + blocks.block_s * np.arange(-1, look_ahead + 1))
+    )
+    wrong = np.flatnonzero(counts != blocks.rows_per_block)
+    block = int(wrong[0]) if wrong.size else 0
+    found = str(counts[block]) if wrong.size else "them unevenly spaced"
+    return InvalidInputError(
+        f"imu: expected {blocks.rows_per_block} samples in the {1e3 * blocks.block_s:.0f} ms that begin "
+        f"{1e3 * (block - 1) * blocks.block_s:+.0f} ms from the source frame (the paper's layout of raw samples), "
+        f"found {found}",
+        code="imu_window_count",
+        field="imu.timestamps_ns",
+    )
 
 
 def _look_ahead(interval_s: float, blocks: PaperBlocks) -> int:

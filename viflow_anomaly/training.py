@@ -57,7 +57,7 @@ class TrainingRun:
         )
         source = self._relit(batch.source).contiguous(memory_format=torch.channels_last)
         with torch.autocast(torch.device(self.device).type, dtype=torch.bfloat16, enabled=self.config.autocast):
-            output = self.network(source, batch.motion, batch.interval_s)
+            output = self.network(source, batch.motion, batch.interval_s, batch.motor)
         output = output._replace(flow_px=output.flow_px.float())
         loss, winners = self._loss(output, batch)
         self.optimizer.zero_grad(set_to_none=True)
@@ -108,14 +108,7 @@ class TrainingRun:
         if loaded is None:
             return False
         tensors, record = loaded
-        for key, value in fingerprint.items():
-            before, now = record.get(key), json.loads(json.dumps(value))
-            if before != now:
-                raise ConfigError(
-                    f"{folder}: --resume expects the {key} that the run was started with, {_difference(before, now)}",
-                    code="resume_config_differs",
-                    field=key,
-                )
+        _require_same_run(folder, record, fingerprint)
         try:
             self.network.load_state_dict(_below(tensors, "model."))
             self._restore_optimizer(_below(tensors, "optimizer."))
@@ -138,6 +131,17 @@ class TrainingRun:
             same_layout = torch.empty_like(like).copy_(value) if value.shape == like.shape else value
             states.setdefault(int(index), {})[name] = same_layout
         self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": states})
+
+
+def _require_same_run(folder: Path, record: Mapping[str, Any], fingerprint: Mapping[str, Any]) -> None:
+    for key, value in fingerprint.items():
+        before, now = record.get(key), json.loads(json.dumps(value))
+        if before != now:
+            raise ConfigError(
+                f"{folder}: --resume expects the {key} that the run was started with, {_difference(before, now)}",
+                code="resume_config_differs",
+                field=key,
+            )
 
 
 def _below(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
@@ -195,7 +199,6 @@ def train(
     loss = _loss_name(model, training)
     require_ground_truth(validation)
     torch.set_num_threads(training.threads)
-    run = TrainingRun(model=model, training=training, device=device)
     data = sorted(data, key=lambda path: (path.name, path))  # what a step draws depends on their order
     fingerprint = {
         "model": model.model_dump(mode="json"),
@@ -203,18 +206,19 @@ def train(
         "recordings": [path.name for path in data],
         "validation": sorted(path.name for path in validation),
     }
-    if resume:
-        run.restore(out_dir, fingerprint)
-    elif (out_dir / "state.safetensors").exists():
-        raise ConfigError(
-            f"{out_dir}: expected a directory without a training run, found one; --resume goes on with it",
-            code="training_exists",
-            field="out",
-        )
-    with TrainingProgress(out_dir, steps=training.steps, first_step=run.step, visible=progress) as reporter:
+    first_step = _first_step(out_dir, fingerprint, resume=resume)
+    with TrainingProgress(out_dir, steps=training.steps, first_step=first_step, visible=progress) as reporter:
         training_data = load_training_data(
-            data, model, training.look_aheads, measure=loss == "corrected", on_progress=reporter.loading
+            data,
+            model,
+            training.look_aheads,
+            measure=loss == "corrected",
+            seed=training.seed,
+            on_progress=reporter.loading,
         )
+        run = TrainingRun(model=training_data.model, training=training, device=device)
+        if resume:
+            run.restore(out_dir, fingerprint)
         errors = _run_steps(run, training_data, validation, out_dir, fingerprint, reporter)
     provenance = {
         "package_version": __version__,
@@ -232,7 +236,23 @@ def train(
     }
     name = f"viflow-{model.preset}"
     path = out_dir / "model.safetensors"
-    return save_checkpoint(path, run.network, model, name=name, version=__version__, provenance=provenance)
+    return save_checkpoint(path, run.network, run.model_config, name=name, version=__version__, provenance=provenance)
+
+
+def _first_step(out_dir: Path, fingerprint: Mapping[str, Any], *, resume: bool) -> int:
+    """Where a run goes on: found out before minutes of loading, as is a state that it cannot go on from."""
+    loaded = load_training_state(out_dir)
+    if loaded is None:
+        return 0
+    if not resume:
+        raise ConfigError(
+            f"{out_dir}: expected a directory without a training run, found one; --resume goes on with it",
+            code="training_exists",
+            field="out",
+        )
+    _require_same_run(out_dir, loaded[1], fingerprint)
+    step = loaded[1].get("step")
+    return step if isinstance(step, int) else 0
 
 
 def _run_steps(

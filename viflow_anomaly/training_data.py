@@ -21,7 +21,8 @@ from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.measured_flow import MeasuredFlow, measure_flow
 from viflow_anomaly.model.layers import FLOW_STRIDE
 from viflow_anomaly.motion_input import MotionWindow, build_motion_window
-from viflow_anomaly.sensor_data import Frame, FramePair, Uint8Array
+from viflow_anomaly.motor_input import MIRRORED_DISPLACEMENT_SIGNS, encode, fitted_motor, require_command
+from viflow_anomaly.sensor_data import Float64Array, Frame, FramePair, Uint8Array
 from viflow_anomaly.view import make_view
 
 FRAMES_HELD = 8
@@ -39,7 +40,9 @@ class PairBucket:
         pairs: [P, 2] indices into ``frames`` (source, target).
         motion: [P, T, 6] windows.
         interval_s: [P].
-        mirrorable: [P] the window is in camera axes, so that a mirrored pair has a known motion.
+        mirrorable: [P] the window is in camera axes and the motor input no command, so that a mirrored pair has a known
+            motion.
+        motor: [P, C] displacements or commands, not yet encoded, or None.
         measured_px, confidence: [P, h/4, w/4(, 2)] what ``measure_flow`` found (confidence in 1/255), or None.
     """
 
@@ -48,6 +51,7 @@ class PairBucket:
     motion: Float32Array
     interval_s: Float32Array
     mirrorable: NDArray[np.bool_]
+    motor: Float64Array | None = None
     measured_px: NDArray[np.float16] | None = None
     confidence: Uint8Array | None = None
 
@@ -64,10 +68,19 @@ class PairBucket:
 
 @dataclass(frozen=True, eq=False)
 class TrainingData:
-    """Buckets, how many pairs they hold, and why others were left out (fault code -> count)."""
+    """Buckets, how many pairs they hold, and why others were left out (fault code -> count).
+
+    ``model`` is the configuration that was asked for, its motor stream fitted to the pairs.
+    """
 
     buckets: tuple[PairBucket, ...]
     excluded: dict[str, int]
+    model: ModelConfig
+
+    @property
+    def motor(self) -> Float64Array | None:
+        """[P, C] displacements or commands of all pairs, None for models without a motor stream."""
+        return _all_commands(self.buckets)
 
     @property
     def pair_count(self) -> int:
@@ -87,7 +100,13 @@ class TrainingData:
         mirrored = (rng.random(batch_size) < 0.5) & bucket.mirrorable[chosen]
         source[mirrored], target[mirrored] = source[mirrored, :, ::-1], target[mirrored, :, ::-1]
         motion[mirrored] *= np.array(MIRRORED_MOTION_SIGNS, dtype=np.float32)
-        batch = collate_arrays(source, target, motion, bucket.interval_s[chosen], device)
+        interval_s = bucket.interval_s[chosen]
+        motor = None
+        if bucket.motor is not None:
+            commands = bucket.motor[chosen].copy()
+            commands[mirrored] *= MIRRORED_DISPLACEMENT_SIGNS if mirrored.any() else 1
+            motor = encode(commands, interval_s, self.model)
+        batch = collate_arrays(source, target, motion, interval_s, motor, device=device)
         if bucket.measured_px is None:
             return batch
         measured = [bucket.measured(int(one), mirrored=bool(flip)) for one, flip in zip(chosen, mirrored, strict=True)]
@@ -100,6 +119,7 @@ class _Growing:
     pairs: list[tuple[int, int]]
     windows: list[MotionWindow]
     mirrorable: list[bool]
+    motor: list[Float64Array]
     measured_px: list[NDArray[np.float16]]
     confidence: list[Uint8Array]
 
@@ -110,18 +130,22 @@ def load_training_data(
     look_aheads: Sequence[int],
     *,
     measure: bool = False,
+    seed: int = 0,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> TrainingData:
     """Read recordings of any known layout. A pair that cannot be used is counted, by the code of its fault.
 
     Args:
+        seed: of the clustering of displacements; a configuration that is fitted already is kept.
         measure: measure the flow of every pair, too (milliseconds each, 5 bytes a flow cell).
 
     Raises:
-        DatasetError: as ``open_recording``; ``training_data_empty`` when no pair is left.
+        DatasetError: as ``open_recording``; ``training_data_empty`` when no pair is left; ``trajectory_missing`` for a
+            model whose motor input is a displacement; ``motor_commands_differ`` in length.
         InvalidInputError: as ``make_view`` for the camera of a whole recording.
+        ConfigError: as ``fitted_motor``.
     """
-    buckets: dict[tuple[int, int], _Growing] = defaultdict(lambda: _Growing([], [], [], [], [], []))
+    buckets: dict[tuple[int, int], _Growing] = defaultdict(lambda: _Growing([], [], [], [], [], [], []))
     excluded: Counter[str] = Counter()
     for done, path in enumerate(paths):
         _add_recording(path, config, look_aheads, buckets, excluded, measure=measure)
@@ -135,7 +159,26 @@ def load_training_data(
             code="training_data_empty",
             field="data",
         )
-    return TrainingData(tuple(_finished(bucket) for bucket in filled), dict(excluded))
+    lengths = sorted({len(command) for bucket in filled for command in bucket.motor})
+    if len(lengths) > 1:
+        raise DatasetError(
+            f"training data: expected motor commands of one length in all recordings, found {lengths} numbers",
+            code="motor_commands_differ",
+            field="data",
+        )
+    finished = tuple(_finished(bucket) for bucket in filled)
+    return TrainingData(finished, dict(excluded), _fitted(config, finished, seed=seed))
+
+
+def _all_commands(buckets: Sequence[PairBucket]) -> Float64Array | None:
+    commands = [bucket.motor for bucket in buckets if bucket.motor is not None]
+    return np.concatenate(commands) if commands else None
+
+
+def _fitted(config: ModelConfig, buckets: Sequence[PairBucket], *, seed: int) -> ModelConfig:
+    commands = _all_commands(buckets)
+    is_fitted = bool(config.motor.centroids_m if config.motor_source == "displacement" else config.motor.mean)
+    return config if commands is None or is_fitted else fitted_motor(commands, config, seed=seed)
 
 
 def _add_recording(
@@ -148,11 +191,12 @@ def _add_recording(
     measure: bool,
 ) -> None:
     recording = open_recording(path)
-    pairs = RecordingPairs(recording, look_aheads)
+    pairs = RecordingPairs(recording, look_aheads, motor_source=config.motor_source)
     camera = recording.camera
     if camera is not None:  # one that cannot be used would exclude every pair: said at once instead
         make_view(config.view, width=camera.width, height=camera.height, camera=camera)
     in_camera_axes = config.motion_window.axes == "camera" and camera is not None and camera.T_cam_imu is not None
+    mirrorable = in_camera_axes and config.motor_source != "command"
     # A few at a time: whole recordings at the source images' size would not fit into memory.
     read = lru_cache(maxsize=FRAMES_HELD)(partial(_read, recording))
     places: dict[int, int] = {}  # of the frames of usable pairs in their bucket
@@ -161,9 +205,10 @@ def _add_recording(
             source, target = (_require(read(one)) for one in indices)
             pair = FramePair(source, target, pairs.imu(index), camera)
             window = _require_judgeable(build_motion_window(pair, config.motion_window))
+            motor = None if config.motor_source is None else require_command(pairs.motor_command(index), config)
             height, width = source.image.shape
             view = make_view(config.view, width=width, height=height, camera=camera)
-        except InvalidInputError as err:
+        except (InvalidInputError, DatasetError) as err:
             excluded[err.code] += 1
             continue
         bucket = buckets[view.height, view.width]
@@ -173,7 +218,9 @@ def _add_recording(
                 bucket.frames.append(view.render(frame.image))
         bucket.pairs.append((places[indices[0]], places[indices[1]]))
         bucket.windows.append(window)
-        bucket.mirrorable.append(in_camera_axes)
+        bucket.mirrorable.append(mirrorable)
+        if motor is not None:
+            bucket.motor.append(motor)
         if measure:
             views = (bucket.frames[place] for place in bucket.pairs[-1])
             measured = measure_flow(*views, stride=FLOW_STRIDE, thorough=True)
@@ -209,6 +256,7 @@ def _finished(bucket: _Growing) -> PairBucket:
         motion=np.stack([window.values for window in bucket.windows]),
         interval_s=np.array([window.interval_s for window in bucket.windows], dtype=np.float32),
         mirrorable=np.array(bucket.mirrorable, dtype=np.bool_),
+        motor=np.stack(bucket.motor) if bucket.motor else None,
         measured_px=np.stack(bucket.measured_px) if bucket.measured_px else None,
         confidence=np.stack(bucket.confidence) if bucket.confidence else None,
     )

@@ -125,6 +125,21 @@ def test_euroc_gyro_is_the_ground_truth_rotation() -> None:
     assert np.abs(expected).max() > 0.01
 
 
+def test_euroc_trajectory_turns_the_camera_as_the_gyro_says() -> None:
+    recording = open_recording(real("euroc/V1_01_easy"))
+    trajectory, camera = recording.trajectory, recording.camera
+    assert trajectory is not None
+    assert camera is not None
+    pairs = list(itertools.pairwise(recording.frame_timestamps_ns.tolist()))
+    found = np.array([so3_log(trajectory.motion(*pair)[:3, :3].T) for pair in pairs])
+    expected = gyro_turns(recording, bias=(-0.0022, 0.0215, 0.0770)) @ camera.R_cam_imu.T
+    np.testing.assert_allclose(found, expected, atol=2e-3)  # Vicon's noise; the states are 5 ms apart
+    assert np.abs(expected).max() > 0.01
+    moved = np.linalg.norm([trajectory.displacement_m(*pair) for pair in pairs], axis=1)
+    assert 0.2 < moved.mean() / 0.05 < 2.0  # an easy flight, m/s
+    assert np.abs(np.diff(moved)).max() < 0.02  # it accelerates by less than 8 m/s^2
+
+
 def test_euroc_images_turn_as_the_gyro_says_through_T_cam_imu() -> None:
     recording = open_recording(real("euroc/V1_01_easy"))
     assert recording.camera is not None

@@ -51,7 +51,10 @@ def test_a_named_format_that_does_not_fit(tmp_path: Path) -> None:
 
 
 def test_an_unknown_format(tmp_path: Path) -> None:
-    assert "euroc, kitti_raw, kitti_odometry, plain" in expect("format_unknown", tmp_path, format="tum").message
+    assert (
+        "euroc, kitti_raw, kitti_odometry, kitti_odometry_raw, plain"
+        in expect("format_unknown", tmp_path, format="tum").message
+    )
 
 
 def test_a_folder_of_several_formats_is_the_first_of_the_registry(tmp_path: Path) -> None:

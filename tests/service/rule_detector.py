@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from viflow_anomaly.config import DetectorConfig
+from viflow_anomaly.config import DetectorConfig, MotorSource
 from viflow_anomaly.detection import (
     AnalyzedRegion,
     Detection,
@@ -35,6 +35,7 @@ class RuleDetector:
         calls: list[tuple[FramePair, DetectorConfig]] | None = None,
     ) -> None:
         self.config = config or DetectorConfig()
+        self.motor_source: MotorSource | None = None
         self.model_info = MODEL
         self.may_go = may_go
         self.error = error

@@ -42,7 +42,11 @@ def batch(
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: DIR-detections", show_default=False)] = None,
     layout: Annotated[
         str | None,
-        typer.Option("--format", metavar="NAME", help="euroc, kitti_raw, kitti_odometry or plain; default by content."),
+        typer.Option(
+            "--format",
+            metavar="NAME",
+            help="euroc, kitti_raw, kitti_odometry, kitti_odometry_raw or plain; default by content.",
+        ),
     ] = None,
     camera: Annotated[str | None, typer.Option(metavar="NAME", help="Which camera, e.g. cam1 or image_03.")] = None,
     look_ahead: Annotated[int, typer.Option(min=1, max=4, help="Frames from source to target.")] = 1,

@@ -33,6 +33,10 @@ def detect(
         int | None, typer.Option(min=0, metavar="NS", help="Stamp of TARGET; an imu.json may hold it.")
     ] = None,
     camera: Annotated[Path | None, typer.Option(metavar="FILE", help="camera.json: intrinsics and mounting.")] = None,
+    motor_command: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,...", help="Speed or displacement, for a model with a motor input."),
+    ] = None,
     overlay: Annotated[Path | None, typer.Option(metavar="PNG", help="Also draw the regions into this file.")] = None,
     masks: Annotated[bool | None, typer.Option("--masks", help="Add each region's mask (COCO RLE).")] = None,
     as_json: AsJson = False,
@@ -55,10 +59,12 @@ def detect(
     settings = settings_from(config, assignments, options)
     from viflow_anomaly.cli.pair_files import PairFiles, load_pair
     from viflow_anomaly.detection import to_json
+    from viflow_anomaly.motor_input import require_supported
 
-    files = PairFiles(source, target, imu, camera, source_timestamp_ns, target_timestamp_ns)
+    files = PairFiles(source, target, imu, camera, source_timestamp_ns, target_timestamp_ns, _numbers(motor_command))
     pair, decode_ms = load_pair(files, limits=settings.limits)
     detector = load_detector(settings)
+    require_supported(pair, detector.motor_source)
     if overlay is None:
         detection = detector.detect(pair, decode_ms=decode_ms)
     else:
@@ -68,6 +74,15 @@ def detect(
         detection = analysis.detection
         write_png(overlay, overlay_of(pair, analysis))
     print(to_json(detection)) if as_json else _print_table(detection)
+
+
+def _numbers(text: str | None) -> tuple[float, ...] | None:
+    try:
+        return None if text is None else tuple(float(number) for number in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(
+            f"expected numbers separated by commas, found {text!r}", param_hint="--motor-command"
+        ) from None
 
 
 def _print_table(detection: Detection) -> None:

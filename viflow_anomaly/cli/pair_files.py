@@ -44,6 +44,7 @@ class PairFiles:
     camera: Path | None = None
     source_timestamp_ns: int | None = None
     target_timestamp_ns: int | None = None
+    motor_command: tuple[float, ...] | None = None
 
 
 def load_pair(files: PairFiles, *, limits: ImageLimits) -> tuple[FramePair, float]:
@@ -62,7 +63,8 @@ def load_pair(files: PairFiles, *, limits: ImageLimits) -> tuple[FramePair, floa
     target = _read_frame(files.target, target_ns, limits=limits, field="target")
     decode_ms = (time.perf_counter() - started) * 1e3
     imu = _samples(document) if document is not None else _samples_around(files.imu, source_ns, target_ns, camera)
-    return FramePair(source=source, target=target, imu=imu, camera=camera), decode_ms
+    command = None if files.motor_command is None else np.array(files.motor_command)
+    return FramePair(source=source, target=target, imu=imu, camera=camera, motor_command=command), decode_ms
 
 
 def _stamp(files: PairFiles, document: ImuDocument | None, name: str) -> int:

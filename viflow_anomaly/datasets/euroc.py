@@ -11,6 +11,8 @@ mav0/
     sensor.yaml       T_BS (optional: without it the mounting is unknown)
   state_groundtruth_estimate0/
     data.csv          #timestamp,p_RS_R_x,p_RS_R_y,p_RS_R_z [m],q_RS_w,q_RS_x,q_RS_y,q_RS_z,... (optional)
+  motor0/
+    data.csv          #timestamp [ns],<names...>: the platform's commands or speeds; not EuRoC's (optional)
 ```
 
 ``T_BS`` maps sensor coordinates to the body, so ``T_cam_imu = inv(T_BS_cam) @ T_BS_imu``. A ``timeshift_cam_imu`` in
@@ -29,6 +31,7 @@ import numpy as np
 import yaml
 
 from viflow_anomaly.config import ImageLimits
+from viflow_anomaly.datasets.motor_table import read_motor
 from viflow_anomaly.datasets.recording import FileRecording
 from viflow_anomaly.datasets.tables import csv_malformed, read_frame_list, read_lines, read_stamped_numbers, read_text
 from viflow_anomaly.datasets.trajectory import Trajectory, rigid, rotations_of
@@ -68,7 +71,8 @@ def open_euroc(root: Path, *, camera: str | None, limits: ImageLimits) -> FileRe
 
     Raises:
         DatasetError: ``camera_unknown``, ``csv_malformed``, ``timestamps_not_increasing``, ``image_missing``,
-            ``yaml_malformed``, ``calibration_malformed``; the trajectory is read when it is asked for.
+            ``yaml_malformed``, ``calibration_malformed``, ``motor_not_covering``; the trajectory is read when
+            it is asked for.
     """
     chosen = camera or _cameras(root)[0]
     if chosen not in _cameras(root):
@@ -76,16 +80,21 @@ def open_euroc(root: Path, *, camera: str | None, limits: ImageLimits) -> FileRe
             f"{root}: expected one of {', '.join(_cameras(root))}, found camera {chosen!r}", code="camera_unknown"
         )
     folder = root / chosen
-    stamps, paths = read_frame_list(folder / "data.csv", ("timestamp", "filename"), folder / "data", header="comment")
+    frames = read_frame_list(folder / "data.csv", ("timestamp", "filename"), folder / "data", header="comment")
     imu_stamps, values = read_stamped_numbers(root / "imu0" / "data.csv", IMU_COLUMNS, header="comment")
+    calibration = read_camera(folder / "sensor.yaml", root / "imu0" / "sensor.yaml")
+    offset_ns = 0 if calibration is None else round(calibration.time_offset_s * 1e9)
+    motor_names, commands = read_motor(root / "motor0" / "data.csv", frames.timestamps_ns + offset_ns)
     return FileRecording(
         name=(root.resolve().parent if root.resolve().name == "mav0" else root.resolve()).name,
         root=root,
         format="euroc",
-        camera=read_camera(folder / "sensor.yaml", root / "imu0" / "sensor.yaml"),
+        camera=calibration,
         imu=ImuLog(imu_stamps, values[:, :3], values[:, 3:]),
-        frame_timestamps_ns=stamps,
-        frame_paths=tuple(paths),
+        frame_timestamps_ns=frames.timestamps_ns,
+        frame_paths=tuple(frames.paths),
+        motor_commands=commands,
+        motor_names=motor_names,
         limits=limits,
         read_trajectory=partial(
             read_trajectory, root / "state_groundtruth_estimate0" / "data.csv", folder / "sensor.yaml"

@@ -159,17 +159,21 @@ def read_oxts_folder(folder: Path, span: tuple[int, int] | None = None) -> tuple
             among them stays; None: all.
 
     Raises:
-        DatasetError: ``oxts_malformed`` (also without any record), ``timestamps_malformed``, ``timestamps_missing``,
-            ``file_name_malformed``, ``file_missing``, ``text_not_utf8``.
+        DatasetError: ``oxts_malformed`` (also without any record), ``imu_not_covering`` (none inside ``span``),
+            ``timestamps_malformed``, ``timestamps_missing``, ``file_name_malformed``, ``file_missing``,
+            ``text_not_utf8``.
     """
     stamps = read_stamps(folder / "timestamps.txt")
     files = numbered_files(folder / "data", (".txt",))
     if span is not None:
         inside = [number for number in files if number in stamps and span[0] <= stamps[number] <= span[1]]
         files = {number: file for number, file in files.items() if inside and inside[0] <= number <= inside[-1]}
+    if not files and span is not None:
+        raise DatasetError(
+            f"{folder}: expected records between {span[0]} and {span[1]} ns, found none", code="imu_not_covering"
+        )
     if not files:
-        when = "" if span is None else f" between {span[0]} and {span[1]} ns"
-        raise DatasetError(f"{folder / 'data'}: expected at least one record{when}, found none", code="oxts_malformed")
+        raise DatasetError(f"{folder / 'data'}: expected at least one record, found none", code="oxts_malformed")
     numbers = np.array([stamp_of(folder / "timestamps.txt", stamps, number) for number in files], dtype=np.int64)
     return numbers, [read_oxts_file(file) for file in files.values()]
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import overload
 
+from viflow_anomaly.config import MotorSource
 from viflow_anomaly.datasets.recording import Recording
-from viflow_anomaly.errors import InvalidInputError
-from viflow_anomaly.sensor_data import FramePair, ImuSamples
+from viflow_anomaly.errors import DatasetError, InvalidInputError
+from viflow_anomaly.sensor_data import Float64Array, FramePair, ImuSamples
 
 MAX_LOOK_AHEAD = 4
 
@@ -36,10 +37,16 @@ class RecordingPairs(Sequence[FramePair]):
         look_aheads: each between 1 and 4.
         before_s, after_s: how much IMU to take before the source and after the target.
         max_interval_s: pairs whose frames lie further apart are not in the sequence but in ``skipped``.
+        motor_source: what ``FramePair.motor_command`` gets: the recording's own command at the source frame where it
+            has one, or the camera's displacement along its trajectory (``ModelConfig.motor_source``).
 
     Attributes:
         indices: (source, target) frame indices of each pair.
         skipped: those left out because of ``max_interval_s``.
+
+    Raises:
+        DatasetError: ``trajectory_missing``: a displacement is asked for and the recording has no poses; as
+            ``Recording.trajectory``.
     """
 
     def __init__(
@@ -50,6 +57,7 @@ class RecordingPairs(Sequence[FramePair]):
         before_s: float = 0.25,
         after_s: float = 0.25,
         max_interval_s: float | None = None,
+        motor_source: MotorSource | None = "command",
     ) -> None:
         for name, margin in (("before_s", before_s), ("after_s", after_s)):
             if not 0 <= margin < float("inf"):
@@ -57,6 +65,14 @@ class RecordingPairs(Sequence[FramePair]):
                     f"{name}: expected seconds from 0 up, found {margin}", code="margin_out_of_range", field=name
                 )
         self.recording = recording
+        self._trajectory = recording.trajectory if motor_source == "displacement" else None
+        if motor_source == "displacement" and self._trajectory is None:
+            raise DatasetError(
+                f"{recording.root}: expected poses of the camera (this model's motor input is a displacement), "
+                f"found none in this {recording.format} recording",
+                code="trajectory_missing",
+                field="motor_command",
+            )
         self.before_s = before_s
         self.after_s = after_s
         self.indices: list[tuple[int, int]] = []
@@ -81,7 +97,7 @@ class RecordingPairs(Sequence[FramePair]):
         Raises:
             IndexError: outside the sequence.
             InvalidInputError: as ``Recording.frame``, ``ImuLog.between`` and ``FramePair``.
-            DatasetError: ``image_missing``.
+            DatasetError: ``image_missing``, ``trajectory_not_covering``.
         """
         if isinstance(index, slice):
             return [self[k] for k in range(*index.indices(len(self)))]
@@ -91,8 +107,18 @@ class RecordingPairs(Sequence[FramePair]):
             target=self.recording.frame(target),
             imu=self.imu(index),
             camera=self.recording.camera,
-            motor_command=self.recording.motor_command(source),
+            motor_command=self.motor_command(index),
         )
+
+    def motor_command(self, index: int) -> Float64Array | None:
+        """[M] command or displacement of pair ``index``, None where the recording has no commands.
+
+        Raises:
+            DatasetError: ``trajectory_not_covering``.
+        """
+        if self._trajectory is not None:
+            return self._trajectory.displacement_m(*self.stamps(index))
+        return self.recording.motor_command(self.indices[index][0])
 
     def stamps(self, index: int) -> tuple[int, int]:
         """(source, target) stamps of pair ``index`` in camera time, nanoseconds; no image is read."""

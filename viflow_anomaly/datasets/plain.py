@@ -3,6 +3,7 @@
 ```
 DIR/
   frames.csv        timestamp_ns,filename          (names relative to DIR)
+                    optional further columns motor_<name>: the platform's command or speed at each frame, by name
   imu.csv           timestamp_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z    rad/s, m/s^2
   camera.json       optional: fx fy cx cy width height distortion_model distortion_coeffs T_cam_imu time_offset_s
   *.png, *.jpg
@@ -19,13 +20,14 @@ from pathlib import Path
 from viflow_anomaly.config import ImageLimits
 from viflow_anomaly.datasets.camera_json import camera_from_mapping
 from viflow_anomaly.datasets.recording import FileRecording
-from viflow_anomaly.datasets.tables import read_frame_list, read_lines, read_stamped_numbers, read_text
+from viflow_anomaly.datasets.tables import csv_malformed, read_frame_list, read_lines, read_stamped_numbers, read_text
 from viflow_anomaly.errors import DatasetError, InvalidInputError
 from viflow_anomaly.imu_log import ImuLog
 from viflow_anomaly.sensor_data import PinholeCamera
 
 NEEDS = "frames.csv and imu.csv"
 FRAME_COLUMNS = ("timestamp_ns", "filename")
+MOTOR_PREFIX = "motor_"
 GYRO_COLUMNS = ("timestamp_ns", "gyro_x", "gyro_y", "gyro_z")
 IMU_COLUMNS = (*GYRO_COLUMNS, "accel_x", "accel_y", "accel_z")
 
@@ -52,17 +54,43 @@ def open_plain(root: Path, *, camera: str | None, limits: ImageLimits) -> FileRe
             f"{root}: expected no choice of camera, the plain layout has only one, found {camera!r}",
             code="camera_unknown",
         )
-    stamps, paths = read_frame_list(root / "frames.csv", FRAME_COLUMNS, root, header="names")
+    motor_names = read_motor_names(root / "frames.csv")
+    columns = (*FRAME_COLUMNS, *(MOTOR_PREFIX + name for name in motor_names))
+    frames = read_frame_list(root / "frames.csv", columns, root, header="names")
     return FileRecording(
         name=root.resolve().name,
         root=root,
         format="plain",
         camera=read_camera(root / "camera.json"),
         imu=read_imu(root / "imu.csv"),
-        frame_timestamps_ns=stamps,
-        frame_paths=tuple(paths),
+        frame_timestamps_ns=frames.timestamps_ns,
+        frame_paths=tuple(frames.paths),
+        motor_commands=frames.values if motor_names else None,
+        motor_names=motor_names,
         limits=limits,
     )
+
+
+def read_motor_names(path: Path) -> tuple[str, ...]:
+    """What the columns of ``frames.csv`` after ``filename`` are called, without ``motor_``; empty where they are none.
+
+    Raises:
+        DatasetError: ``csv_malformed``: a column that does not begin with ``motor_``, has no name after it, or has that
+            of another; ``file_missing``, ``text_not_utf8``.
+    """
+    lines = read_lines(path)
+    cells = [cell.strip().lower() for cell in lines[0].text.lstrip("#").split(",")] if lines else []
+    if tuple(cells[:2]) != FRAME_COLUMNS:
+        return ()  # read_frame_list says what is wrong
+    names = tuple(cell.removeprefix(MOTOR_PREFIX) for cell in cells[2:])
+    if not all(cell.startswith(MOTOR_PREFIX) for cell in cells[2:]) or "" in names or len(set(names)) < len(names):
+        raise csv_malformed(
+            path,
+            lines[0].number,
+            f"expected {','.join(FRAME_COLUMNS)} and further columns motor_<name>, each with a name of its own, found "
+            f"{lines[0].text[:120]!r}",
+        )
+    return names
 
 
 def read_imu(path: Path) -> ImuLog:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from viflow_anomaly.config import ImageLimits
-from viflow_anomaly.datasets import euroc, kitti_odometry, kitti_raw, plain
+from viflow_anomaly.datasets import euroc, kitti_odometry, kitti_odometry_raw, kitti_raw, plain
 from viflow_anomaly.datasets.recording import FileRecording, Recording
 from viflow_anomaly.errors import DatasetError
 
@@ -39,6 +39,9 @@ READERS: dict[str, Reader] = {
     "euroc": Reader(euroc.find_root, euroc.open_euroc, euroc.NEEDS),
     "kitti_raw": Reader(kitti_raw.find_root, kitti_raw.open_kitti_raw, kitti_raw.NEEDS),
     "kitti_odometry": Reader(kitti_odometry.find_root, kitti_odometry.open_kitti_odometry, kitti_odometry.NEEDS),
+    "kitti_odometry_raw": Reader(
+        kitti_odometry_raw.find_root, kitti_odometry_raw.open_kitti_odometry_raw, kitti_odometry_raw.NEEDS
+    ),
     "plain": Reader(plain.find_root, plain.open_plain, plain.NEEDS),
 }
 

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 
@@ -121,20 +122,30 @@ def read_stamped_numbers(path: Path, columns: Sequence[str], *, header: str) -> 
     return np.array(stamps, dtype=np.int64), np.array(rows, dtype=np.float64)
 
 
-def read_frame_list(path: Path, columns: Sequence[str], images: Path, *, header: str) -> tuple[Int64Array, list[Path]]:
-    """A table of stamp and file name: stamps [F], strictly increasing, and the image files below ``images``.
+class FrameList(NamedTuple):
+    """Stamps [F], strictly increasing; F image files; the numbers of further columns [F, C]."""
+
+    timestamps_ns: Int64Array
+    paths: list[Path]
+    values: Float64Array
+
+
+def read_frame_list(path: Path, columns: Sequence[str], images: Path, *, header: str) -> FrameList:
+    """A table of stamp, file name (below ``images``) and, where ``columns`` has more than two, numbers.
 
     Raises:
         DatasetError: ``timestamps_not_increasing``, ``image_missing`` (the table names a file that is not there),
             ``csv_malformed``, ``file_missing``, ``text_not_utf8``.
     """
-    stamps, lines, paths = [], [], []
+    stamps, lines, paths, values = [], [], [], []
     for line, cells in read_csv(path, columns, header=header):
         stamps.append(parse_integer_ns(path, line, cells[0]))
         lines.append(line)
         paths.append(_image_below(path, line, images, cells[1]))
+        values.append(parse_numbers(path, line, cells[2:]))
     check_increasing(path, stamps, lines)
-    return np.array(stamps, dtype=np.int64), paths
+    numbers = np.array(values, dtype=np.float64).reshape(len(stamps), len(columns) - 2)
+    return FrameList(np.array(stamps, dtype=np.int64), paths, numbers)
 
 
 def _image_below(path: Path, line: int, images: Path, name: str) -> Path:
@@ -152,11 +163,11 @@ def _image_below(path: Path, line: int, images: Path, name: str) -> Path:
 
 
 def check_increasing(path: Path, stamps: Sequence[int], lines: Sequence[int]) -> None:
-    """Raises DatasetError ``timestamps_not_increasing`` at the first frame stamp that is not later than the last."""
+    """Raises DatasetError ``timestamps_not_increasing`` at the first stamp that is not later than the last."""
     for earlier, later, line in zip(stamps[:-1], stamps[1:], lines[1:], strict=True):
         if later <= earlier:
-            problem = "a duplicate of the frame before it" if later == earlier else f"{later} after {earlier}"
+            problem = "a duplicate of the one before it" if later == earlier else f"{later} after {earlier}"
             raise DatasetError(
-                f"{path}, line {line}: expected frame stamps that increase, found {problem}",
+                f"{path}, line {line}: expected stamps that increase, found {problem}",
                 code="timestamps_not_increasing",
             )

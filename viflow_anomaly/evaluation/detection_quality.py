@@ -54,7 +54,7 @@ def measure_detection(
             measured; as ``open_recording``.
     """
     groups: dict[str, dict[str, dict[tuple[float, float], DetectionScores]]] = {}
-    opened = [open_with_ground_truth(path) for path in recordings]
+    opened = [open_with_ground_truth(path, motor_source=detector.motor_source) for path in recordings]
     for done, (pairs, truth) in enumerate(opened, start=1):
         group = groups.setdefault(pairs.recording.name.split("_", 1)[0], {})
         for index in range(0, len(pairs), every):

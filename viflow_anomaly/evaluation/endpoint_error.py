@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from viflow_anomaly.config import CorrectionConfig, ModelConfig
+from viflow_anomaly.config import CorrectionConfig, ModelConfig, MotorSource
 from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.datasets.registry import open_recording
 from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
@@ -96,7 +96,7 @@ def measure_endpoint_errors(
     """
     opened: list[tuple[RecordingPairs, SimulatedGroundTruth, int]] = []
     for path in recordings:
-        pairs, truth = open_with_ground_truth(path)
+        pairs, truth = open_with_ground_truth(path, motor_source=config.motor_source)
         opened += [(pairs, truth, index) for index in range(len(pairs))]
     if max_pairs is not None and len(opened) > max_pairs:
         opened = [opened[k] for k in np.linspace(0, len(opened) - 1, max_pairs).round().astype(int)]
@@ -119,7 +119,9 @@ def require_ground_truth(recordings: Sequence[Path]) -> None:
         truth.static_flow(*pairs.stamps(0))
 
 
-def open_with_ground_truth(path: Path) -> tuple[RecordingPairs, SimulatedGroundTruth]:
+def open_with_ground_truth(
+    path: Path, *, motor_source: MotorSource | None = "command"
+) -> tuple[RecordingPairs, SimulatedGroundTruth]:
     """The adjacent pairs of a simulated recording and its ground truth.
 
     Raises:
@@ -127,7 +129,7 @@ def open_with_ground_truth(path: Path) -> tuple[RecordingPairs, SimulatedGroundT
     """
     recording = open_recording(path)
     truth = SimulatedGroundTruth.find(recording.root)
-    pairs = RecordingPairs(recording)
+    pairs = RecordingPairs(recording, motor_source=motor_source)
     if truth is None or not pairs:
         found = "none" if truth is None else f"{len(recording)} frame"
         raise DatasetError(

@@ -25,8 +25,16 @@ def build_model(config: ModelConfig, *, seed: int = 0) -> nn.Module:
     """A freshly initialised network; the same seed gives the same weights and leaves the global generator alone.
 
     Raises:
-        ConfigError: ``config_invalid``: a crop that is no multiple of 32, or the paper preset without its crop.
+        ConfigError: ``config_invalid``: a crop that is no multiple of 32, or the paper preset without its crop;
+            ``motor_not_fitted``: a motor stream whose number of inputs only a training knows.
     """
+    if config.motor_source is not None and not config.motor_numbers:
+        raise ConfigError(
+            f"model.motor: expected values fitted by a training for the motion inputs {config.motion_inputs!r}, "
+            "found none",
+            code="motor_not_fitted",
+            field="model.motor",
+        )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         if config.preset == "paper":
@@ -37,7 +45,8 @@ def build_model(config: ModelConfig, *, seed: int = 0) -> nn.Module:
             widths=widths,
             motion_width=motion_width,
             code_width=code_width,
-            motion_rows=config.motion_window.rows,
+            motion_rows=config.motion_window.rows if config.uses_imu else 0,
+            motor_numbers=config.motor_numbers,
             interval_rows=config.motion_window.samples_between,
             hypotheses=config.hypotheses,
             focal_px=config.view.focal_px,
@@ -63,4 +72,9 @@ def _build_paper(config: ModelConfig) -> nn.Module:
             code="config_invalid",
             field="view",
         )
-    return PaperViflow(motion_rows=config.motion_window.rows, hypotheses=config.hypotheses, image_size=(side, side))
+    return PaperViflow(
+        motion_rows=config.motion_window.rows if config.uses_imu else 0,
+        motor_numbers=config.motor_numbers,
+        hypotheses=config.hypotheses,
+        image_size=(side, side),
+    )

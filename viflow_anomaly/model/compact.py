@@ -32,10 +32,17 @@ class CompactViflow(ConvolutionalViflow):
             assert head.bias is not None
             nn.init.zeros_(head.bias)
 
-    def forward(self, source: torch.Tensor, motion: torch.Tensor, interval_s: torch.Tensor) -> ViflowOutput:
-        """source [B, 1, H, W] in 0..1, motion [B, T, 6], interval_s [B] -> flow [B, K, 2, ceil(H/4), ceil(W/4)]."""
+    def forward(
+        self,
+        source: torch.Tensor,
+        motion: torch.Tensor,
+        interval_s: torch.Tensor,
+        motor: torch.Tensor | None = None,
+    ) -> ViflowOutput:
+        """source [B, 1, H, W] in 0..1, motion [B, T, 6], interval_s [B], motor [B, M] where the network has that stream
+        -> flow [B, K, 2, ceil(H/4), ceil(W/4)]."""
         height, width = source.shape[-2:]
-        code = self.motion_encoder(motion, interval_s)
+        code = self.motion_code(motion, interval_s, motor)
         rays = self.rays(source)
         still = rays.new_zeros(1, 1, 3)
         turned = rigid_flow(rays, rays.new_zeros(1, 1, 1, 1), self.rotation(motion, interval_s), still)

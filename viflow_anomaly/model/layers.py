@@ -43,6 +43,32 @@ class MotionEncoder(nn.Module):
         return code
 
 
+class MotorEncoder(nn.Module):
+    """Motor numbers -> code [B, C]: the second stream of the paper's global shifter, in the same three layers.
+
+    Args:
+        numbers: M, of ``ModelConfig.motor_numbers``.
+        width: of the hidden layers.
+        code_width: C.
+    """
+
+    def __init__(self, *, numbers: int, width: int, code_width: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Linear(numbers, width),
+            nn.LeakyReLU(0.1, inplace=True),
+            nn.Linear(width, width),
+            nn.LeakyReLU(0.1, inplace=True),
+            nn.Linear(width, code_width),
+            nn.LeakyReLU(0.1, inplace=True),
+        )
+
+    def forward(self, motor: torch.Tensor) -> torch.Tensor:
+        """motor [B, M] -> code [B, C]."""
+        code: torch.Tensor = self.layers(motor)
+        return code
+
+
 class Modulate(nn.Module):
     """Scale and shift feature maps by the motion code (FiLM)."""
 
@@ -68,18 +94,20 @@ class ConvolutionalViflow(nn.Module):
     """The trunk that the presets share: motion code, gyro rotation, and image features at stride 4 modulated by motion.
 
     Args:
-        motion_rows: T of the [T, 6] window.
+        motion_rows: T of the [T, 6] window; 0: no IMU stream, and no rotation is known.
+        motor_numbers: M of the motor stream; 0: none. The codes of two streams are concatenated [Approach].
         interval_rows: how many of them, at its end, cover the frame interval evenly.
         hypotheses: K.
         focal_px: pixels that the coordinate inputs are divided by (the view's focal length).
         widths: channels at strides 4, 8, 16, 32.
-        motion_width, code_width: of the motion encoder.
+        motion_width, code_width: of each stream's encoder.
     """
 
     def __init__(
         self,
         *,
         motion_rows: int,
+        motor_numbers: int,
         interval_rows: int,
         hypotheses: int,
         focal_px: float,
@@ -92,9 +120,14 @@ class ConvolutionalViflow(nn.Module):
         self.interval_rows = interval_rows
         self.hypotheses = hypotheses
         self.focal_px = focal_px
-        self.mounting = nn.Linear(3, 3, bias=False)
-        nn.init.eye_(self.mounting.weight)
-        self.motion_encoder = MotionEncoder(rows=motion_rows, width=motion_width, code_width=code_width)
+        self.mounting, self.motion_encoder, self.motor_encoder = None, None, None
+        if motion_rows:
+            self.mounting = nn.Linear(3, 3, bias=False)
+            nn.init.eye_(self.mounting.weight)
+            self.motion_encoder = MotionEncoder(rows=motion_rows, width=motion_width, code_width=code_width)
+        if motor_numbers:
+            self.motor_encoder = MotorEncoder(numbers=motor_numbers, width=motion_width, code_width=code_width)
+        code_width *= bool(motion_rows) + bool(motor_numbers)
         self.encode4 = _convolution(16 + 2, w4)
         self.encode8 = nn.Sequential(_convolution(w4, w8, stride=2), _convolution(w8, w8))
         self.encode16 = nn.Sequential(_convolution(w8, w16, stride=2), _convolution(w16, w16))
@@ -108,8 +141,23 @@ class ConvolutionalViflow(nn.Module):
         self.decode8 = _convolution(w8, w4)
         self.modulate4 = Modulate(code_width=code_width, channels=w4)
 
+    def motion_code(self, motion: torch.Tensor, interval_s: torch.Tensor, motor: torch.Tensor | None) -> torch.Tensor:
+        """motion [B, T, 6], interval_s [B], motor [B, M] or None -> [B, C], the streams' codes side by side."""
+        codes = []
+        if self.motion_encoder is not None:
+            codes.append(self.motion_encoder(motion, interval_s))
+        if self.motor_encoder is not None:
+            assert motor is not None
+            codes.append(self.motor_encoder(motor))
+        return torch.cat(codes, dim=1)
+
     def rotation(self, motion: torch.Tensor, interval_s: torch.Tensor) -> torch.Tensor:
-        """[B, 3, 3]: the gyro's turn between the frames, source-camera to target-camera coordinates."""
+        """[B, 3, 3]: the gyro's turn between the frames, source-camera to target-camera coordinates.
+
+        Without an IMU stream nothing is known of it: the identity.
+        """
+        if self.mounting is None:
+            return torch.eye(3, device=motion.device, dtype=motion.dtype).repeat(len(interval_s), 1, 1)
         rate = motion[:, -self.interval_rows :, :3].mean(dim=1)
         turned = rate * interval_s[:, None]
         return rotation_matrix(-(turned.unsqueeze(1) * self.mounting.weight).sum(dim=-1))

@@ -15,29 +15,44 @@ LOCAL_FILTERS = (32, 64, 128, 256, 512)
 FUSION_WIDTH = 4096
 
 
-class PaperGlobalShifter(nn.Module):
-    """Motion input -> code, and for each hypothesis a 2x3 affine matrix on normalised coordinates.
+def _stream(numbers: int) -> nn.Sequential:
+    """One modality's four fully connected layers of 512, 4096, 4096, 512."""
+    layers: list[nn.Module] = []
+    for width_in, width in pairwise((numbers, *GLOBAL_WIDTHS)):
+        layers += [nn.Linear(width_in, width), nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers)
 
-    Four fully connected layers of 512, 4096, 4096, 512; the affine layers start at the identity.
+
+class PaperGlobalShifter(nn.Module):
+    """Motion inputs -> code, and for each hypothesis a 2x3 affine matrix on normalised coordinates.
+
+    Each modality goes through four fully connected layers of its own; two codes are concatenated to 1024 numbers. The
+    affine layers start at the identity.
+
+    Args:
+        motion_numbers: of the IMU stream, 0: none.
+        motor_numbers: of the motor stream, 0: none.
+        hypotheses: K.
     """
 
-    def __init__(self, *, motion_numbers: int, hypotheses: int) -> None:
+    def __init__(self, *, motion_numbers: int, motor_numbers: int, hypotheses: int) -> None:
         super().__init__()
-        layers: list[nn.Module] = []
-        width_in = motion_numbers
-        for width in GLOBAL_WIDTHS:
-            layers += [nn.Linear(width_in, width), nn.ReLU(inplace=True)]
-            width_in = width
-        self.trunk = nn.Sequential(*layers)
+        self.trunk = _stream(motion_numbers) if motion_numbers else None
+        self.motor_trunk = _stream(motor_numbers) if motor_numbers else None
+        width_in = self.code_width = GLOBAL_WIDTHS[-1] * (bool(motion_numbers) + bool(motor_numbers))
         self.affine = nn.ModuleList(nn.Linear(width_in, 6) for _ in range(hypotheses))
         for layer in self.affine:
             assert isinstance(layer, nn.Linear)
             nn.init.zeros_(layer.weight)
             layer.bias.data = torch.tensor([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
 
-    def forward(self, motion: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """motion [B, T, 6] -> code [B, 512], affine matrices [B, K, 2, 3]."""
-        code = self.trunk(motion.flatten(1))
+    def forward(self, motion: torch.Tensor, motor: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """motion [B, T, 6], motor [B, M] or None -> code [B, 512 or 1024], affine matrices [B, K, 2, 3]."""
+        codes = [] if self.trunk is None else [self.trunk(motion.flatten(1))]
+        if self.motor_trunk is not None:
+            assert motor is not None
+            codes.append(self.motor_trunk(motor))
+        code = torch.cat(codes, dim=1)
         matrices = torch.stack([layer(code) for layer in self.affine], dim=1)
         return code, matrices.view(-1, len(self.affine), 2, 3)
 
@@ -73,16 +88,21 @@ class PaperViflow(nn.Module):
     network must be shared there too.)
 
     Args:
-        motion_rows: T of the [T, 6] window (50 for EuRoC, 20 for KITTI).
+        motion_rows: T of the [T, 6] window (50 for EuRoC, 20 for KITTI); 0: no IMU stream.
+        motor_numbers: M of the motor stream (20 clusters in the paper); 0: none.
         hypotheses: K.
         image_size: (height, width), multiples of 32; the fully connected fusion fixes it.
     """
 
-    def __init__(self, *, motion_rows: int, hypotheses: int, image_size: tuple[int, int] = (224, 224)) -> None:
+    def __init__(
+        self, *, motion_rows: int, hypotheses: int, motor_numbers: int = 0, image_size: tuple[int, int] = (224, 224)
+    ) -> None:
         super().__init__()
         height, width = image_size
         self.image_size = image_size
-        self.global_shifter = PaperGlobalShifter(motion_numbers=motion_rows * 6, hypotheses=hypotheses)
+        self.global_shifter = PaperGlobalShifter(
+            motion_numbers=motion_rows * 6, motor_numbers=motor_numbers, hypotheses=hypotheses
+        )
         filters = (1, *LOCAL_FILTERS)
         layers: list[nn.Module] = []
         for filters_in, filters_out in pairwise(filters):
@@ -91,7 +111,7 @@ class PaperViflow(nn.Module):
         self.code_shape = (LOCAL_FILTERS[-1], height // 32, width // 32)
         code_numbers = self.code_shape[0] * self.code_shape[1] * self.code_shape[2]
         self.fusion = nn.Sequential(
-            nn.Linear(code_numbers + GLOBAL_WIDTHS[-1], FUSION_WIDTH),
+            nn.Linear(code_numbers + self.global_shifter.code_width, FUSION_WIDTH),
             nn.ReLU(inplace=True),
             nn.Linear(FUSION_WIDTH, code_numbers),
             nn.ReLU(inplace=True),
@@ -99,10 +119,17 @@ class PaperViflow(nn.Module):
         self.decoders = nn.ModuleList(PaperDecoder() for _ in range(hypotheses))
         self.register_buffer("grid", torch.from_numpy(pixel_grid(height, width)), persistent=False)
 
-    def forward(self, source: torch.Tensor, motion: torch.Tensor, interval_s: torch.Tensor) -> ViflowOutput:
-        """source [B, 1, H, W] in 0..1, motion [B, T, 6] -> flow [B, K, 2, H, W] px (the interval is not used)."""
+    def forward(
+        self,
+        source: torch.Tensor,
+        motion: torch.Tensor,
+        interval_s: torch.Tensor,
+        motor: torch.Tensor | None = None,
+    ) -> ViflowOutput:
+        """source [B, 1, H, W] in 0..1, motion [B, T, 6], motor [B, M] where the network has that stream
+        -> flow [B, K, 2, H, W] px (the interval is not used)."""
         del interval_s  # the paper's window says it by its zero rows
-        code, matrices = self.global_shifter(motion)
+        code, matrices = self.global_shifter(motion, motor)
         features = self.encoder(source).flatten(1)
         fused = self.fusion(torch.cat([features, code], dim=1)).unflatten(1, self.code_shape)
         local = torch.stack([decoder(fused) for decoder in self.decoders], dim=1)  # B, K, 2, H, W

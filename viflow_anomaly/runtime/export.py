@@ -17,6 +17,7 @@ from torch import nn
 
 from viflow_anomaly.checkpoint import load_checkpoint
 from viflow_anomaly.checkpoint_record import bundled_checkpoint, write_atomically, write_record
+from viflow_anomaly.config import ModelConfig
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.model.layers import COARSEST_STRIDE
 from viflow_anomaly.model.outputs import ViflowOutput
@@ -32,8 +33,8 @@ class _Tensors(nn.Module):
         super().__init__()
         self.network = network
 
-    def forward(self, source: torch.Tensor, motion: torch.Tensor, interval_s: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        output: ViflowOutput = self.network(source, motion, interval_s)
+    def forward(self, *inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        output: ViflowOutput = self.network(*inputs)
         return (output.flow_px,) if output.scene is None else (output.flow_px, *output.scene)
 
 
@@ -67,9 +68,9 @@ def export_onnx(path: Path | None, out: Path | None = None) -> Path:
         raise ConfigError(
             f"export: expected the name of an .onnx file to write, found {str(out)!r}", code="export_name", field="out"
         )
-    source, motion, interval_s = _example(record.model.motion_window.rows, record.model.view)
-    stride = network(source, motion, interval_s).stride
-    program = _traced(network, (source, motion, interval_s), fixed=record.model.preset == "paper")
+    inputs = _example(record.model)
+    stride = network(*inputs).stride
+    program = _traced(network, inputs, fixed=record.model.preset == "paper")
     with tempfile.TemporaryDirectory() as folder:
         whole = Path(folder) / "network.onnx"
         program.save(str(whole))
@@ -113,16 +114,20 @@ def _quiet() -> Iterator[None]:
         exporter.setLevel(level)
 
 
-def _example(rows: int, view: Any) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _example(model: ModelConfig) -> tuple[torch.Tensor, ...]:
+    view = model.view
     side = (view.crop_size, view.crop_size) if view.mode == "center_crop" else (224, 320)
-    return torch.rand(1, 1, *side), torch.zeros(1, rows, 6), torch.full((1,), 0.05)
+    imu = (torch.zeros(1, model.motion_window.rows, 6), torch.full((1,), 0.05))
+    motor = (torch.zeros(1, model.motor_numbers),) if model.motor_numbers else ()
+    return torch.rand(1, 1, *side), *imu, *motor
 
 
 def _traced(network: nn.Module, inputs: tuple[torch.Tensor, ...], *, fixed: bool) -> Any:
     shapes: Any = None
     if not fixed:
         height, width = torch.export.Dim("rows", min=1, max=256), torch.export.Dim("columns", min=1, max=256)
-        shapes = ({2: COARSEST_STRIDE * height, 3: COARSEST_STRIDE * width}, {}, {})
+        fixed_ones: tuple[Any, ...] = ({},) * (len(inputs) - 1)
+        shapes = (({2: COARSEST_STRIDE * height, 3: COARSEST_STRIDE * width}, *fixed_ones),)  # of *inputs
     scene = network(*inputs).scene is not None
     with _quiet(), torch.no_grad():
         return torch.onnx.export(
@@ -130,7 +135,7 @@ def _traced(network: nn.Module, inputs: tuple[torch.Tensor, ...], *, fixed: bool
             inputs,
             dynamo=True,
             opset_version=OPSET,
-            input_names=list(exported.INPUT_NAMES),
+            input_names=list(exported.INPUT_NAMES[: len(inputs)]),
             output_names=list(exported.SCENE_OUTPUTS if scene else exported.FLOW_OUTPUTS),
             dynamic_shapes=shapes,
             verbose=False,

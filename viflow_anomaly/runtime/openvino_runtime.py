@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import threading
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -12,6 +11,7 @@ import numpy as np
 import openvino
 
 from viflow_anomaly.checkpoint_record import CheckpointRecord, corrupt_checkpoint, read_checkpoint_file
+from viflow_anomaly.config import ModelConfig
 from viflow_anomaly.errors import CheckpointError
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.model_input import ModelInput
@@ -74,7 +74,7 @@ class OpenvinoRuntime:
         self._core = openvino.Core()
         try:
             metadata = exported_metadata(self._core.read_model(data))
-            same_model = json.loads(metadata[MODEL_KEY]) == record.model.model_dump(mode="json")
+            same_model = ModelConfig.model_validate_json(metadata[MODEL_KEY]) == record.model
         except (RuntimeError, LookupError, ValueError) as err:
             raise corrupt_checkpoint(
                 path, f"expected an ONNX network of this package, found: {str(err)[-200:]}"
@@ -92,9 +92,10 @@ class OpenvinoRuntime:
         height, width = model_input.source.shape
         request, inputs, outputs = self._request((height, width))
         np.multiply(model_input.source, np.float32(1 / 255), out=inputs["source"][0, 0])
-        inputs["motion"][0] = model_input.window.values
-        if "interval_s" in inputs:  # an export drops what its network ignores
-            inputs["interval_s"][0] = model_input.window.interval_s
+        window = model_input.window
+        given: dict[str, Any] = {"motion": window.values, "interval_s": window.interval_s, "motor": model_input.motor}
+        for name in given.keys() & inputs.keys():  # an export drops what its network ignores
+            inputs[name][0] = given[name]
         request.infer()
         flow_px = np.ascontiguousarray(outputs["flow_px"][0].transpose(0, 2, 3, 1))
         if "inverse_depth" not in outputs:

@@ -31,7 +31,7 @@ class TorchRuntime:
         cuda = torch.device(self._device).type == "cuda"
         with torch.inference_mode(), torch.autocast("cuda", dtype=torch.bfloat16, enabled=cuda):
             source = batch.source.contiguous(memory_format=torch.channels_last)
-            output = self._network(source, batch.motion, batch.interval_s)
+            output = self._network(source, batch.motion, batch.interval_s, batch.motor)
         scene = None
         if output.scene is not None:
             inverse_depth, rotation, translation = (one[0].float().cpu().numpy() for one in output.scene)

@@ -28,7 +28,7 @@ class SimulatorConfig(FrozenConfig):
     ground_truth: bool = True
     movers: tuple[int, int] = Field(default=(0, 4), description="least and most independently moving objects")
     motion: Literal["normal", "static", "rotation"] = "normal"
-    imu_errors: bool = Field(default=True, description="biases, white noise, vibration")
+    imu_errors: bool = Field(default=True, description="biases, white noise, vibration; the motor's scale and noise")
     jobs: PositiveInt = Field(default=1, description="processes")
 
     @model_validator(mode="before")

@@ -1,4 +1,4 @@
-"""Writes the EuRoC ASL tree: sensor.yaml and data.csv of camera, IMU and state ground truth."""
+"""Writes the EuRoC ASL tree: sensor.yaml and data.csv of camera, IMU, state ground truth, and the motor."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from viflow_anomaly.sensor_data import Float64Array
 from viflow_anomaly.simulator.imu import ImuRecord
 from viflow_anomaly.simulator.motion import BodyMotion, quaternions_wxyz
+from viflow_anomaly.simulator.motor import MotorRecord
 from viflow_anomaly.simulator.rigs import Rig
 
 Int64Array = NDArray[np.int64]
@@ -83,3 +84,11 @@ def write_states(mav0: Path, stamps_ns: Int64Array, motion: BodyMotion, record: 
     quaternions = quaternions_wxyz(motion.R_world_body)
     columns = [motion.positions_m, quaternions, motion.velocities_m_s, record.gyro_bias_rad_s, record.accel_bias_m_s2]
     _write_table(folder / "data.csv", STATE_HEADER, stamps_ns, np.hstack(columns))
+
+
+def write_motor(mav0: Path, record: MotorRecord) -> None:
+    """``motor0/data.csv``: the platform's speed or command; EuRoC itself has none."""
+    folder = mav0 / "motor0"
+    folder.mkdir(parents=True, exist_ok=True)
+    header = "#" + ",".join(("timestamp [ns]", *record.names))
+    _write_table(folder / "data.csv", header, record.stamps_ns, record.values)

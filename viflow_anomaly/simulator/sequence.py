@@ -16,11 +16,12 @@ from viflow_anomaly.datasets.simulated_ground_truth import OBJECT_COLUMNS
 from viflow_anomaly.sensor_data import Float64Array, Uint8Array
 from viflow_anomaly.simulator.config import SimulatorConfig
 from viflow_anomaly.simulator.drive import drive, park
-from viflow_anomaly.simulator.euroc_writer import write_camera, write_imu, write_states
+from viflow_anomaly.simulator.euroc_writer import write_camera, write_imu, write_motor, write_states
 from viflow_anomaly.simulator.flight import fly
 from viflow_anomaly.simulator.ground_truth import flow_truth, visible_objects
 from viflow_anomaly.simulator.imu import measure
 from viflow_anomaly.simulator.motion import BodyMotion
+from viflow_anomaly.simulator.motor import MotorRecord, record_car, record_drone
 from viflow_anomaly.simulator.movers import airborne_movers
 from viflow_anomaly.simulator.photometry import draw_photometry
 from viflow_anomaly.simulator.rendering import SceneRenderer
@@ -36,7 +37,9 @@ EPOCH_NS = 1_500_000_000_000_000_000
 LEAD_S = 0.5  # of IMU before the first frame and after the last
 OBJECT_MATERIALS = 14
 # One generator for each concern, so that a draw added to one does not change the others.
-STREAMS = {name: index for index, name in enumerate(("rig", "motion", "movers", "scene", "imu", "camera", "noise"))}
+STREAMS = {
+    name: index for index, name in enumerate(("rig", "motion", "movers", "scene", "imu", "camera", "noise", "motor"))
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +115,22 @@ def build_world(config: SimulatorConfig, seed: int) -> World:
     return World(rig, motion, stamps, frame_indices, camera_poses, scene)
 
 
+def record_motor(config: SimulatorConfig, seed: int, world: World) -> MotorRecord:
+    """The platform's speed or command at the IMU's rate, from a generator of its own."""
+    rng, motion, rig = _stream(seed, "motor"), world.motion, world.rig
+    if config.rig == "car":
+        R_world_vehicle = motion.R_world_body @ rig.R_vehicle_imu.T
+        return record_car(rng, world.stamps_ns, motion.velocities_m_s, R_world_vehicle, errors=config.imu_errors)
+    return record_drone(
+        rng,
+        world.stamps_ns,
+        motion.velocities_m_s,
+        motion.R_world_body,
+        rate_hz=rig.imu_rate_hz,
+        errors=config.imu_errors,
+    )
+
+
 def write_sequence(config: SimulatorConfig, seed: int, folder: Path) -> None:
     """Write the sequence of that seed into an empty directory.
 
@@ -124,6 +143,7 @@ def write_sequence(config: SimulatorConfig, seed: int, folder: Path) -> None:
     write_camera(mav0, world.rig, world.frame_stamps_ns)
     write_imu(mav0, world.rig, world.stamps_ns, record)
     write_states(mav0, world.stamps_ns, world.motion, record)
+    write_motor(mav0, record_motor(config, seed, world))
     with SceneRenderer(world.scene, world.rig.camera, supersampling=config.supersampling) as renderer:
         _write_images(config, seed, world, renderer, mav0)
 
