@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lidar_drive import CAMERA, POST_M, SPEED_M, WALL_M, drive_world, scan_of, wall_and_post, write_drive
-from worlds import write_lines
+from worlds import stamp_text, write_lines
 
 from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
 from viflow_anomaly.errors import DatasetError
@@ -177,3 +177,17 @@ def test_malformed_motions_are_named(drive: Path, frame: str, moving: str) -> No
     with pytest.raises(DatasetError, match="line 2") as raised:
         render_lidar(drive)
     assert raised.value.code == "labels_malformed"
+
+
+def test_frames_beyond_the_poses_are_left_out(drive: Path) -> None:
+    later = [*STAMPS[:3], STAMPS[3] + 10**10]
+    write_lines(drive / "image_02/timestamps.txt", [stamp_text(stamp) for stamp in later])
+    summary = render_lidar(drive)
+    assert (summary.frames, summary.with_scan, summary.written, summary.with_flow) == (4, 2, 2, 1)
+
+
+def test_without_any_pose_there_is_no_truth(drive: Path) -> None:
+    write_lines(drive / "image_02/timestamps.txt", [stamp_text(stamp + 10**10) for stamp in STAMPS])
+    with pytest.raises(DatasetError) as raised:
+        render_lidar(drive)
+    assert raised.value.code == "trajectory_not_covering"

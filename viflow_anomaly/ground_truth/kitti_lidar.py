@@ -48,7 +48,7 @@ BOX_MARGIN = 0.05
 
 @dataclass(frozen=True)
 class LidarSummary:
-    """What one run did: of ``frames``, how many have a scan, were written now, had been before, have flow to their next
+    """What one run did: of ``frames``, how many have a scan and a pose, were written now, had been before, have flow to their next
     frame, have no labels (there, nothing that moves could be left out). The rest counts points in the frames written
     now: static ones that are visible, hidden ones, and those in boxes of what may move."""
 
@@ -83,14 +83,15 @@ def render_lidar(
 
     Raises:
         DatasetError: ``camera_missing``, ``mounting_missing``, ``scans_missing``, ``scan_malformed``,
-            ``trajectory_missing``; as ``open_recording``, ``read_doubtful_boxes`` and ``TruthFolder``.
+            ``trajectory_not_covering`` (no frame has a pose); as ``open_recording``, ``read_doubtful_boxes`` and ``TruthFolder``.
     """
     recording = open_recording(drive, format="kitti_raw", camera=camera, limits=ImageLimits())
     assert isinstance(recording, FileRecording)
     lens = require_camera(recording)
     T_cam_velo = _scanner_mounting(recording, lens)
-    scans = _scans(recording)
     poses = _poses(recording)
+    stamps = recording.frame_timestamps_ns.tolist()
+    scans = [scan for scan in _scans(recording) if stamps[scan[0]] in poses]
     labelled = recording.frame_path(0).parent.parent.name == LABELLED_CAMERA
     boxes = read_doubtful_boxes(recording.root) if labelled else {}
     record = {**record_head(recording.name, lens), "made_from": {"scans": "velodyne_points", "labels": bool(boxes)}}
@@ -98,9 +99,8 @@ def render_lidar(
     scale = _label_scale(recording, lens)
     counts = np.zeros(3, dtype=np.int64)
     kept = with_flow = without_labels = 0
-    stamps = recording.frame_timestamps_ns.tolist()
     for done, (index, number, scan) in enumerate(scans, start=1):
-        target = stamps[index + 1] if index + 1 < len(stamps) else None
+        target = stamps[index + 1] if index + 1 < len(stamps) and stamps[index + 1] in poses else None
         with_flow += target is not None
         without_labels += number not in boxes
         if folder.has(stamps[index]):
@@ -140,10 +140,19 @@ def _scans(recording: FileRecording) -> list[tuple[int, int, Path]]:
 
 
 def _poses(recording: FileRecording) -> dict[int, Float64Array]:
+    """{stamp: T_world_cam} of the frames that the OXTS records cover."""
     trajectory = recording.trajectory
-    if trajectory is None:
-        raise DatasetError(f"{recording.root}: expected poses from OXTS, found none", code="trajectory_missing")
-    return {stamp: trajectory.pose(stamp) for stamp in recording.frame_timestamps_ns.tolist()}
+    assert trajectory is not None  # there is one wherever the mounting is known
+    poses = {}
+    problem: DatasetError | None = None
+    for stamp in recording.frame_timestamps_ns.tolist():
+        try:
+            poses[stamp] = trajectory.pose(stamp)
+        except DatasetError as err:
+            problem = err
+    if not poses and problem is not None:
+        raise problem
+    return poses
 
 
 def _scanner_mounting(recording: FileRecording, camera: PinholeCamera) -> Float64Array:
