@@ -48,9 +48,9 @@ BOX_MARGIN = 0.05
 
 @dataclass(frozen=True)
 class LidarSummary:
-    """What one run did: of ``frames``, how many have a scan and a pose, were written now, had been before, have flow to their next
-    frame, have no labels (there, nothing that moves could be left out). The rest counts points in the frames written
-    now: static ones that are visible, hidden ones, and those in boxes of what may move."""
+    """What one run did: of ``frames``, how many have a scan and a pose, were written now, had been before, have flow to
+    their next frame, have no labels (there, nothing that moves could be left out). The rest counts points in the frames
+    written now: static ones that are visible, hidden ones, and those in boxes of what may move."""
 
     folder: Path
     frames: int
@@ -83,7 +83,8 @@ def render_lidar(
 
     Raises:
         DatasetError: ``camera_missing``, ``mounting_missing``, ``scans_missing``, ``scan_malformed``,
-            ``trajectory_not_covering`` (no frame has a pose); as ``open_recording``, ``read_doubtful_boxes`` and ``TruthFolder``.
+            ``trajectory_not_covering`` (no frame has a pose); as ``open_recording``, ``read_doubtful_boxes`` and
+            ``TruthFolder``.
     """
     recording = open_recording(drive, format="kitti_raw", camera=camera, limits=ImageLimits())
     assert isinstance(recording, FileRecording)
