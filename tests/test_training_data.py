@@ -3,6 +3,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -12,9 +13,11 @@ from worlds import make_world, textured_image, write_euroc, write_plain, write_p
 
 from viflow_anomaly import training_data
 from viflow_anomaly.batch import Batch
-from viflow_anomaly.config import ModelConfig, MotionWindowConfig, ViewConfig
+from viflow_anomaly.config import ModelConfig, MotionWindowConfig, SplitConfig, ViewConfig
+from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.datasets.recording import Recording
 from viflow_anomaly.datasets.registry import open_recording
+from viflow_anomaly.datasets.splits import split_pairs
 from viflow_anomaly.errors import DatasetError, InvalidInputError
 from viflow_anomaly.geometry import rigid_motion_flow
 from viflow_anomaly.losses import warp
@@ -90,6 +93,23 @@ def test_unusable_pairs_are_counted_by_code(tmp_path: Path) -> None:
     assert data.excluded == {"imu_gap": 1, "imu_not_covering": 1}
     assert data.pair_count == 2
     assert data.buckets[0].pairs.tolist() == [[0, 1], [2, 3]]
+
+
+@pytest.mark.parametrize(("rule", "straddling"), [("random", False), ("blocks", True)])
+def test_what_a_test_needs_is_not_learnt_from(
+    tmp_path: Path, rule: Literal["random", "blocks"], straddling: bool
+) -> None:
+    folder = write_plain(tmp_path / "a", make_world(frames=21))
+    split = SplitConfig(rule=rule, block_s=0.2, seed=3)
+    data = load_training_data([folder], CONFIG, (1, 2), split=split)
+    parts = split_pairs(RecordingPairs(open_recording(folder), (1, 2)), rule, seed=3, block_s=0.2)
+    assert data.pair_count == len(parts.train) > 0
+    assert data.excluded["held_out"] == len(parts.test) > 0
+    assert data.excluded["straddling"] == len(parts.straddling)
+    assert bool(parts.straddling) == straddling
+    frames_of_tests = {frame for k in parts.test for frame in RecordingPairs(open_recording(folder), (1, 2)).indices[k]}
+    if rule == "blocks":
+        assert data.buckets[0].frames.shape[0] == 21 - len(frames_of_tests)
 
 
 def cut_short(path: Path) -> None:

@@ -256,6 +256,18 @@ def loss_of_preset(preset: str) -> str:
     return {"paper": "squared", "compact": "charbonnier", "calibrated": "corrected"}[preset]
 
 
+class SplitConfig(FrozenConfig):
+    """Which pairs of each recording are kept for a test, see ``datasets.splits``; "none": all are for training.
+
+    ``random`` is the paper's rule [Datasets]; its test shares frames with the training.
+    """
+
+    rule: Literal["none", "blocks", "random"] = "none"
+    test_share: float = Field(default=0.2, gt=0, lt=1)
+    block_s: float = Field(default=5.0, ge=0.001, le=1e9)
+    seed: int = Field(default=0, ge=0)
+
+
 class TrainingConfig(FrozenConfig):
     """One training run; the seed fixes everything on a CPU."""
 
@@ -268,6 +280,7 @@ class TrainingConfig(FrozenConfig):
     loss: Literal["auto", "squared", "charbonnier", "corrected"] = "auto"
     relaxation: float = Field(default=0.05, ge=0, lt=1, description="weight of the mean over hypotheses")
     look_aheads: tuple[int, ...] = (1, 2)
+    split: SplitConfig = SplitConfig()
     seed: int = 0
     validate_every: PositiveInt = 1000
     checkpoint_every: PositiveInt = 500

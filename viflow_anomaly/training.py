@@ -214,6 +214,7 @@ def train(
             training.look_aheads,
             measure=loss == "corrected",
             seed=training.seed,
+            split=training.split,
             on_progress=reporter.loading,
         )
         run = TrainingRun(model=training_data.model, training=training, device=device)

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viflow_anomaly.batch import Batch, collate_arrays
-from viflow_anomaly.config import ModelConfig
+from viflow_anomaly.config import ModelConfig, SplitConfig
 from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.datasets.recording import Recording
 from viflow_anomaly.datasets.registry import open_recording
+from viflow_anomaly.datasets.splits import split_pairs
 from viflow_anomaly.errors import DatasetError, InvalidInputError, ViflowError
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.measured_flow import MeasuredFlow, measure_flow
@@ -131,12 +132,15 @@ def load_training_data(
     *,
     measure: bool = False,
     seed: int = 0,
+    split: SplitConfig | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> TrainingData:
     """Read recordings of any known layout. A pair that cannot be used is counted, by the code of its fault.
 
     Args:
         seed: of the clustering of displacements; a configuration that is fitted already is kept.
+        split: which pairs are kept for a test; they are counted in ``excluded`` as ``held_out``, those with a frame on
+            either side as ``straddling``.
         measure: measure the flow of every pair, too (milliseconds each, 5 bytes a flow cell).
 
     Raises:
@@ -148,7 +152,7 @@ def load_training_data(
     buckets: dict[tuple[int, int], _Growing] = defaultdict(lambda: _Growing([], [], [], [], [], [], []))
     excluded: Counter[str] = Counter()
     for done, path in enumerate(paths):
-        _add_recording(path, config, look_aheads, buckets, excluded, measure=measure)
+        _add_recording(path, config, look_aheads, buckets, excluded, measure=measure, split=split or SplitConfig())
         if on_progress is not None:
             on_progress(done + 1, len(paths))
     filled = [buckets[size] for size in sorted(buckets) if buckets[size].pairs]
@@ -189,6 +193,7 @@ def _add_recording(
     excluded: Counter[str],
     *,
     measure: bool,
+    split: SplitConfig,
 ) -> None:
     recording = open_recording(path)
     pairs = RecordingPairs(recording, look_aheads, motor_source=config.motor_source)
@@ -200,7 +205,8 @@ def _add_recording(
     # A few at a time: whole recordings at the source images' size would not fit into memory.
     read = lru_cache(maxsize=FRAMES_HELD)(partial(_read, recording))
     places: dict[int, int] = {}  # of the frames of usable pairs in their bucket
-    for index, indices in enumerate(pairs.indices):
+    for index in _for_training(pairs, split, excluded):
+        indices = pairs.indices[index]
         try:
             source, target = (_require(read(one)) for one in indices)
             pair = FramePair(source, target, pairs.imu(index), camera)
@@ -226,6 +232,14 @@ def _add_recording(
             measured = measure_flow(*views, stride=FLOW_STRIDE, thorough=True)
             bucket.measured_px.append(measured.flow_px.astype(np.float16))
             bucket.confidence.append((measured.confidence * 255).astype(np.uint8))
+
+
+def _for_training(pairs: RecordingPairs, split: SplitConfig, excluded: Counter[str]) -> Sequence[int]:
+    if split.rule == "none":
+        return range(len(pairs))
+    parts = split_pairs(pairs, split.rule, seed=split.seed, test_share=split.test_share, block_s=split.block_s)
+    excluded.update({"held_out": len(parts.test), "straddling": len(parts.straddling)})
+    return parts.train
 
 
 def _read(recording: Recording, index: int) -> Frame | ViflowError:

@@ -8,14 +8,17 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from pair_world import Ask
 from simulated_truth import add_ground_truth, add_movers
-from worlds import make_world, write_euroc
+from worlds import make_world, write_euroc, write_lines
 
 from viflow_anomaly.checkpoint import load_checkpoint, save_checkpoint
-from viflow_anomaly.cli import evaluate as evaluate_module
 from viflow_anomaly.config import ModelConfig
+from viflow_anomaly.datasets.registry import open_recording
+from viflow_anomaly.evaluation.flo_files import write_flo
+from viflow_anomaly.evaluation.flow_report import cpu_model
 from viflow_anomaly.model.builder import build_model
 
 
@@ -38,75 +41,133 @@ def flow(recordings: list[Path], checkpoint: Path, *more: str) -> list[str]:
 
 
 def test_json(ask: Ask, recordings: list[Path], checkpoint: Path) -> None:
-    answer = ask(flow(recordings, checkpoint, "--json"))
+    answer = ask(flow(recordings, checkpoint, "--json", "--methods", "identity,dis-ultrafast"))
     assert (answer.code, answer.err) == (0, "")
     report: dict[str, Any] = json.loads(answer.out)
-    assert list(report) == ["model", "commit", "machine", "date", "all", "groups", "sequences"]
-    assert report["model"] == {
+    assert report["machine"]["cpu"]
+    assert report["machine"]["cores"] == os.cpu_count()
+    assert report["threads"] == 1
+    assert datetime.now(UTC) - datetime.fromisoformat(report["date"]) < timedelta(minutes=5)
+    assert list(report["methods"]) == ["identity", "dis-ultrafast", "untrained", "untrained+correction"]
+    network = report["methods"]["untrained"]
+    assert network["model"] == {
         "name": "untrained",
         "version": "1.2",
         "sha256": load_checkpoint(checkpoint).record.sha256,
     }
-    assert report["machine"]["cpu"]
-    assert report["machine"]["cores"] == os.cpu_count()
-    assert datetime.now(UTC) - datetime.fromisoformat(report["date"]) < timedelta(minutes=5)
-    assert {name: group["pairs"] for name, group in report["groups"].items()} == {"car": 1, "drone": 3}
-    assert {name: one["pairs"] for name, one in report["sequences"].items()} == {
+    assert (network["preset"], network["inputs"], network["hypotheses"]) == ("calibrated", "imu", 4)
+    assert {name: group["untrained"]["pairs"] for name, group in report["groups"].items()} == {"car": 1, "drone": 3}
+    assert {name: one["identity"]["pairs"] for name, one in report["sequences"].items()} == {
         "car_000001": 1,
         "drone_000001": 2,
         "drone_000002": 1,
     }
-    assert set(report["all"]) == {
-        "epe_px",
-        "predicted_epe_px",
-        "identity_epe_px",
-        "epe_ratio",
-        "predicted_epe_ratio",
-        "pairs",
-    }
-    assert report["all"]["pairs"] == 4
-    assert report["all"]["identity_epe_px"] == 2.0
-    assert report["all"]["epe_ratio"] == pytest.approx(report["all"]["epe_px"] / 2.0, abs=1e-3)
+    identity, ours = report["all"]["identity"], report["all"]["untrained+correction"]
+    assert (identity["epe_mean_px"], identity["epe_sd_px"], identity["f1_all"]) == (2.0, 0.0, 0.0)
+    assert identity["runtime_ms"] is None
+    assert ours["epe_ratio"] == pytest.approx(ours["epe_mean_px"] / 2.0, abs=1e-3)
+    assert ours["runtime_ms"] > 0
+    assert report["paper"]["rows"][0]["algorithm"] == "FlowNetC"
 
 
-def test_table(ask: Ask, recordings: list[Path], checkpoint: Path) -> None:
-    answer = ask(flow(recordings, checkpoint))
+def test_table(ask: Ask, recordings: list[Path], checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "150")
+    answer = ask(flow(recordings, checkpoint, "--methods", "identity"))
     assert (answer.code, answer.err) == (0, "")
-    rows = {words[0]: words[1:] for line in answer.out.splitlines() if (words := line.split())}
-    assert rows["model"][:2] == ["untrained", "1.2"]
-    assert rows["model"][2] == f"({load_checkpoint(checkpoint).record.sha256[:8]})"
-    assert {name: row[0] for name, row in rows.items() if name.startswith(("drone", "car", "all"))} == {
-        "car_000001": "1",
-        "drone_000001": "2",
-        "drone_000002": "1",
-        "car": "1",
-        "drone": "3",
-        "all": "4",
-    }
-    assert rows["all"][3] == "2.000"
+    lines = [line.strip() for line in answer.out.splitlines()]
+    assert [line for line in lines if line.endswith((" pair", " pairs"))] == [
+        "car: 1 pair",
+        "drone: 3 pairs",
+        "all pairs: 4 pairs",
+    ]
+    rows = [line.split() for line in lines if line.startswith("identity ")]
+    assert [row[4:8] for row in rows] == [["2.000", "0.000", "2.002", "0.0"]] * 3
+    assert any(line.startswith("VIFlow-IMU+SFFMS") for line in lines)
+    assert any(line.startswith("Runtime: median") and "1 thread(s)" in line for line in lines)
 
 
-def test_out_holds_the_same_json(ask: Ask, recordings: list[Path], checkpoint: Path, tmp_path: Path) -> None:
-    out = tmp_path / "results" / "flow.json"
-    answer = ask(flow(recordings, checkpoint, "--json", "--out", str(out)))
+def test_results_are_written(ask: Ask, recordings: list[Path], checkpoint: Path, tmp_path: Path) -> None:
+    out, markdown, latex = (tmp_path / "results" / f"flow.{kind}" for kind in ("json", "md", "tex"))
+    more = ["--out", str(out), "--markdown", str(markdown), "--latex", str(latex), "--methods", "none"]
+    answer = ask(flow(recordings, checkpoint, "--json", *more))
     assert out.read_text() == answer.out
-    assert list(out.parent.iterdir()) == [out]
-    table = ask(flow(recordings, checkpoint, "--out", str(out)))
-    assert "predicted" in table.out
-    assert json.loads(out.read_text())["groups"] == json.loads(answer.out)["groups"]
+    assert sorted(out.parent.iterdir()) == sorted([out, markdown, latex])
+    assert "| untrained+correction | calibrated | imu | 4 |" in markdown.read_text()
+    assert "untrained+correction & calibrated & imu & 4 &" in latex.read_text()
 
 
-def test_max_pairs(ask: Ask, recordings: list[Path], checkpoint: Path) -> None:
-    report = json.loads(ask(flow(recordings, checkpoint, "--json", "--max-pairs", "2")).out)
-    assert report["all"]["pairs"] == 2
+def test_max_pairs_and_look_aheads(ask: Ask, recordings: list[Path], checkpoint: Path) -> None:
+    quick = ("--json", "--methods", "identity")
+    report = json.loads(ask(flow(recordings, checkpoint, *quick, "--max-pairs", "2")).out)
+    assert report["all"]["identity"]["pairs"] == 2
     assert list(report["sequences"]) == ["car_000001", "drone_000001"]
 
 
-def test_no_motion_at_all_has_no_ratio(ask: Ask, checkpoint: Path, tmp_path: Path) -> None:
-    folder = add_ground_truth(tmp_path / "drone_1", shift_px=0.0)
-    report = json.loads(ask(flow([folder], checkpoint, "--json")).out)
-    assert report["all"]["epe_ratio"] is None
-    assert " nan" in ask(flow([folder], checkpoint)).out
+def test_pairs_further_apart(ask: Ask, checkpoint: Path, tmp_path: Path) -> None:
+    """A camera that stands still: the flow over two frames comes from depth and poses, and is zero."""
+    folder = add_ground_truth(tmp_path / "drone_1", make_world(frames=3, shift_px=0), shift_px=0.0)
+    rows = [f"{stamp},0,0,0,1,0,0,0" for stamp in open_recording(folder).frame_timestamps_ns]
+    write_lines(folder / "mav0/state_groundtruth_estimate0/data.csv", ["#timestamp", *rows])
+    quick = ("--json", "--methods", "identity", "--look-aheads", "2,1")
+    report = json.loads(ask(flow([folder], checkpoint, *quick)).out)
+    assert report["options"]["look_aheads"] == [1, 2]
+    assert (report["all"]["identity"]["pairs"], report["all"]["identity"]["epe_mean_px"]) == (3, 0.0)
+    assert report["all"]["untrained"]["epe_ratio"] is None
+
+
+def test_checkpoints_by_name(ask: Ask, recordings: list[Path], checkpoint: Path) -> None:
+    more = ("--checkpoint", f"second={checkpoint}", "--methods", "none", "--json")
+    uncorrected = ("--set", "detector.correction.enabled=false")
+    assert list(json.loads(ask(flow(recordings[:1], checkpoint, *more, *uncorrected)).out)["methods"]) == [
+        "untrained",
+        "second",
+    ]
+    twice = ask(flow(recordings[:1], checkpoint, "--checkpoint", str(checkpoint)))
+    assert twice.is_refusal("[method_names]")
+    none = ["evaluate", "flow", str(recordings[0]), "--checkpoint", "none"]
+    assert list(json.loads(ask([*none, "--methods", "identity", "--json"]).out)["methods"]) == ["identity"]
+    assert ask([*none, "--methods", "none"]).is_refusal("found none [method_names]")
+
+
+def test_another_methods_results(ask: Ask, recordings: list[Path], tmp_path: Path) -> None:
+    stamp = int(open_recording(recordings[0]).frame_timestamps_ns[1])
+    flow_px = np.full((64, 96, 2), np.nan, np.float32)
+    flow_px[:16] = (-2.0, 1.0)
+    write_flo(tmp_path / "Sparse" / recordings[0].name / f"{stamp}.flo", flow_px)
+    command = ["evaluate", "flow", *map(str, recordings), "--checkpoint", "none", "--methods", "none", "--json"]
+    report = json.loads(ask([*command, "--results", f"Sparse={tmp_path / 'Sparse'}"]).out)
+    found = report["all"]["Sparse"]
+    assert (found["pairs"], found["missing_pairs"]) == (1, {"no_file": 3})
+    assert (found["density"], found["epe_mean_px"], found["runtime_ms"]) == (0.25, 1.0, None)
+    assert ask([*command, "--results", str(tmp_path / "Sparse")]).is_refusal("[results_unnamed]")
+    assert ask([*command, "--results", f"Absent={tmp_path / 'absent'}"]).is_refusal("[results_missing]")
+
+
+def test_ground_truth_beside_the_recording(ask: Ask, checkpoint: Path, tmp_path: Path) -> None:
+    whole = add_ground_truth(tmp_path / "drone_1")
+    bare = write_euroc(tmp_path / "V1_01", make_world(frames=3))
+    quick = ("--json", "--methods", "identity", "--ground-truth", str(whole))
+    report = json.loads(ask(flow([bare], checkpoint, *quick)).out)
+    assert report["sequences"]["V1_01"]["identity"]["epe_mean_px"] == 2.0
+    assert ask(flow([bare, whole], checkpoint, *quick)).is_refusal("[ground_truth_ambiguous]")
+
+
+def test_movers_can_be_left_out(ask: Ask, checkpoint: Path, tmp_path: Path) -> None:
+    folder = add_movers(add_ground_truth(tmp_path / "drone_1"))
+    pixels = [
+        json.loads(ask(flow([folder], checkpoint, "--json", "--methods", "identity", option)).out)["all"]["identity"]
+        for option in ("--movers", "--no-movers")
+    ]
+    assert pixels[0]["pixels"] - pixels[1]["pixels"] == 2 * (140 + 100)
+
+
+def test_pictures(ask: Ask, recordings: list[Path], checkpoint: Path, tmp_path: Path) -> None:
+    answer = ask(flow(recordings[2:], checkpoint, "--methods", "none", "--plots", str(tmp_path / "figures")))
+    assert (answer.code, answer.err) == (0, "")
+    names = {path.name for path in (tmp_path / "figures").iterdir()}
+    assert names == {
+        f"{kind}-car.{end}" for kind in ("flow", "correspondences", "epe-runtime") for end in ("png", "pdf")
+    }
 
 
 def test_refusals(ask: Ask, recordings: list[Path], checkpoint: Path, tmp_path: Path) -> None:
@@ -117,12 +178,15 @@ def test_refusals(ask: Ask, recordings: list[Path], checkpoint: Path, tmp_path: 
     assert ask(flow(recordings, tmp_path / "model.pt")).is_refusal("[checkpoint_not_safetensors]")
     assert ask(flow(recordings, checkpoint, "--device", "abacus")).is_refusal("[device_unavailable]")
     assert ask(flow(recordings, checkpoint, "--max-pairs", "0")).is_refusal("Invalid value for '--max-pairs'")
+    assert ask(flow(recordings, checkpoint, "--look-aheads", "1,5")).is_refusal("[look_ahead_out_of_range]")
+    assert ask(flow(recordings, checkpoint, "--look-aheads", "one")).is_refusal("[look_ahead_out_of_range]")
+    assert ask(flow(recordings, checkpoint, "--methods", "magic")).is_refusal("[method_unknown]")
     assert ask(flow([], checkpoint)).is_refusal("Missing argument")
     assert ask(["evaluate", "speed"]).is_refusal("No such command 'speed'")
 
 
 def test_a_result_that_cannot_be_written(ask: Ask, recordings: list[Path], checkpoint: Path, tmp_path: Path) -> None:
-    answer = ask(flow(recordings[2:], checkpoint, "--out", str(tmp_path)))
+    answer = ask(flow(recordings[2:], checkpoint, "--methods", "none", "--out", str(tmp_path)))
     assert answer.is_refusal(f"{tmp_path.name}: expected a file or nothing there")
 
 
@@ -155,7 +219,7 @@ def test_the_processor_has_a_name_everywhere(monkeypatch: pytest.MonkeyPatch, co
         patch.setattr(Path, "read_text", read_text)
         patch.setattr("platform.processor", lambda: "")
         patch.setattr("platform.machine", lambda: "riscv64")
-        assert evaluate_module._cpu_model() == "riscv64"
+        assert cpu_model() == "riscv64"
 
 
 # --- evaluate detect

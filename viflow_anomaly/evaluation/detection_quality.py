@@ -16,7 +16,7 @@ import numpy as np
 from viflow_anomaly.config import RegionConfig
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.evaluation.detection_scores import DetectionScores, ScoredBox
-from viflow_anomaly.evaluation.endpoint_error import open_with_ground_truth
+from viflow_anomaly.evaluation.flow_truth import RecordingTruth
 from viflow_anomaly.evaluation.labelled_pairs import BoolArray, Labels, labels_of
 from viflow_anomaly.evaluation.rivals import RIVALS
 from viflow_anomaly.geometry import Float32Array
@@ -54,12 +54,12 @@ def measure_detection(
             measured; as ``open_recording``.
     """
     groups: dict[str, dict[str, dict[tuple[float, float], DetectionScores]]] = {}
-    opened = [open_with_ground_truth(path, motor_source=detector.motor_source) for path in recordings]
-    for done, (pairs, truth) in enumerate(opened, start=1):
-        group = groups.setdefault(pairs.recording.name.split("_", 1)[0], {})
-        for index in range(0, len(pairs), every):
-            pair = pairs[index]
-            labels = labels_of(truth, pair.source.timestamp_ns)
+    opened = [RecordingTruth(path) for path in recordings]
+    for done, truth in enumerate(opened, start=1):
+        group = groups.setdefault(truth.sequence.split("_", 1)[0], {})
+        for index in range(0, len(truth), every):
+            pair = truth.pair(index, detector.motor_source)
+            labels = labels_of(truth.ground_truth, pair.source.timestamp_ns)
             _add_ours(group, detector, pair, labels)
             if rivals:
                 _add_rivals(group, detector.config.regions, pair, labels)

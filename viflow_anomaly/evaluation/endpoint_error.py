@@ -13,11 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from viflow_anomaly.config import CorrectionConfig, ModelConfig, MotorSource
-from viflow_anomaly.datasets.pairing import RecordingPairs
-from viflow_anomaly.datasets.registry import open_recording
-from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
+from viflow_anomaly.config import CorrectionConfig, ModelConfig
 from viflow_anomaly.errors import DatasetError
+from viflow_anomaly.evaluation.flow_truth import FlowTruth, RecordingTruth, spread
 from viflow_anomaly.geometry import Float32Array, pixel_grid
 from viflow_anomaly.model_input import prepare
 from viflow_anomaly.prediction import predict_flow
@@ -94,17 +92,12 @@ def measure_endpoint_errors(
         DatasetError: ``ground_truth_missing`` for a recording without ground truth, or with none that is valid for a
             pair; ``ground_truth_malformed``; as ``open_recording``.
     """
-    opened: list[tuple[RecordingPairs, SimulatedGroundTruth, int]] = []
-    for path in recordings:
-        pairs, truth = open_with_ground_truth(path, motor_source=config.motor_source)
-        opened += [(pairs, truth, index) for index in range(len(pairs))]
-    if max_pairs is not None and len(opened) > max_pairs:
-        opened = [opened[k] for k in np.linspace(0, len(opened) - 1, max_pairs).round().astype(int)]
+    chosen = spread([RecordingTruth(path) for path in recordings], max_pairs)
     errors = []
-    for done, one in enumerate(opened, start=1):
-        errors.append(_pair_error(runtime, config, *one, correction or CorrectionConfig()))
+    for done, (truth, index) in enumerate(chosen, start=1):
+        errors.append(_pair_error(runtime, config, truth, index, correction or CorrectionConfig()))
         if on_progress is not None:
-            on_progress(done, len(opened))
+            on_progress(done, len(chosen))
     return EndpointErrors(tuple(errors))
 
 
@@ -115,46 +108,23 @@ def require_ground_truth(recordings: Sequence[Path]) -> None:
         DatasetError: as ``measure_endpoint_errors``; only the ground truth of the first pair is read.
     """
     for path in recordings:
-        pairs, truth = open_with_ground_truth(path)
-        truth.static_flow(*pairs.stamps(0))
-
-
-def open_with_ground_truth(
-    path: Path, *, motor_source: MotorSource | None = "command"
-) -> tuple[RecordingPairs, SimulatedGroundTruth]:
-    """The adjacent pairs of a simulated recording and its ground truth.
-
-    Raises:
-        DatasetError: ``ground_truth_missing`` without ground truth or pairs; as ``open_recording``.
-    """
-    recording = open_recording(path)
-    truth = SimulatedGroundTruth.find(recording.root)
-    pairs = RecordingPairs(recording, motor_source=motor_source)
-    if truth is None or not pairs:
-        found = "none" if truth is None else f"{len(recording)} frame"
-        raise DatasetError(
-            f"{path}: expected a simulated recording with ground truth (groundtruth0) and two frames, found {found}",
-            code="ground_truth_missing",
-            field="validation",
-        )
-    return pairs, truth
+        RecordingTruth(path).truth(0)
 
 
 def _pair_error(
     runtime: Runtime,
     config: ModelConfig,
-    pairs: RecordingPairs,
-    truth: SimulatedGroundTruth,
+    truth: FlowTruth,
     index: int,
     correction: CorrectionConfig,
 ) -> PairError:
-    pair = pairs[index]
+    pair = truth.pair(index, config.motor_source)
     model_input = prepare(pair, config)
     predicted = predict_flow(runtime, model_input, correction, focal_px=config.view.focal_px)
-    flow, valid = truth.static_flow(pair.source.timestamp_ns, pair.target.timestamp_ns)
+    flow, valid = truth.truth(index)
     if not valid.any():
         raise DatasetError(
-            f"{truth.folder}: expected valid static flow at {pair.source.timestamp_ns}, found no valid pixel",
+            f"{truth.sequence}: expected valid static flow at {pair.source.timestamp_ns}, found no valid pixel",
             code="ground_truth_missing",
             field="validation",
         )
@@ -165,7 +135,7 @@ def _pair_error(
         return float(np.linalg.norm(difference, axis=-1)[valid].mean())
 
     return PairError(
-        sequence=pairs.recording.name,
+        sequence=truth.sequence,
         source_timestamp_ns=pair.source.timestamp_ns,
         epe_px=epe(predicted.flow_px),
         predicted_epe_px=epe(predicted.hypothesis_px),

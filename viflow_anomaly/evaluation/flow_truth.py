@@ -1,0 +1,139 @@
+"""Where true flow comes from: pairs of frames, and how the static world moves between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viflow_anomaly.config import MotorSource
+from viflow_anomaly.datasets.pairing import RecordingPairs
+from viflow_anomaly.datasets.registry import open_recording
+from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
+from viflow_anomaly.errors import DatasetError
+from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.sensor_data import FramePair
+
+BoolArray = NDArray[np.bool_]
+
+
+class PairName(NamedTuple):
+    """Which pair: its sequence, how many frames apart, both stamps in nanoseconds."""
+
+    sequence: str
+    look_ahead: int
+    source_timestamp_ns: int
+    target_timestamp_ns: int
+
+    def __str__(self) -> str:
+        return f"{self.sequence} {self.source_timestamp_ns}-{self.target_timestamp_ns}"
+
+
+class TrueFlow(NamedTuple):
+    """flow_px [H, W, 2] float32 in source-image pixels, valid [H, W] where it is known."""
+
+    flow_px: Float32Array
+    valid: BoolArray
+
+
+class FlowTruth(Protocol):
+    """Pairs with ground truth, of one sequence."""
+
+    @property
+    def sequence(self) -> str:
+        """Its name; the group is what stands before the first underscore."""
+
+    def __len__(self) -> int:
+        """How many pairs."""
+
+    def name(self, index: int) -> PairName:
+        """Which pair; no image is read."""
+
+    def pair(self, index: int, motor_source: MotorSource | None = None) -> FramePair:
+        """Both frames with the motor command that a network wants beside them (None: none).
+
+        Raises:
+            InvalidInputError: a pair that cannot be used; it is left out and counted.
+            DatasetError: a recording that cannot be read.
+        """
+
+    def truth(self, index: int) -> TrueFlow:
+        """The true flow from source to target.
+
+        Raises:
+            DatasetError: ``ground_truth_missing`` for a pair without; it is left out and counted.
+                ``ground_truth_malformed``.
+        """
+
+
+class RecordingTruth:
+    """A recording with ground truth in the simulator's layout (``groundtruth0``).
+
+    Args:
+        path: the recording.
+        look_aheads: each between 1 and 4.
+        ground_truth: the folder that holds ``groundtruth0``; None: the recording itself.
+        movers: False: pixels of moving things do not count. The truth is the static world's, so that on a mover a
+            method is wrong for seeing it; needs ``groundtruth0/instances``.
+
+    Raises:
+        DatasetError: ``ground_truth_missing`` without ground truth or pairs; as ``open_recording``.
+        InvalidInputError: as ``RecordingPairs``.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        look_aheads: Sequence[int] = (1,),
+        *,
+        ground_truth: Path | None = None,
+        movers: bool = True,
+    ) -> None:
+        self.recording = open_recording(path)
+        self._movers = movers
+        self._look_aheads = tuple(look_aheads)
+        truth = SimulatedGroundTruth.find(self.recording.root if ground_truth is None else ground_truth)
+        self.pairs = RecordingPairs(self.recording, self._look_aheads, motor_source=None)
+        if truth is None or not self.pairs:
+            found = "none" if truth is None else f"{len(self.recording)} frame"
+            place = path if ground_truth is None else ground_truth
+            raise DatasetError(
+                f"{place}: expected a recording with ground truth (groundtruth0) and two frames, found {found}",
+                code="ground_truth_missing",
+                field="validation",
+            )
+        self.ground_truth = truth
+        self._pairs_by_source: dict[MotorSource | None, RecordingPairs] = {None: self.pairs}
+
+    @property
+    def sequence(self) -> str:
+        return self.recording.name
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def name(self, index: int) -> PairName:
+        source, target = self.pairs.indices[index]
+        return PairName(self.sequence, target - source, *self.pairs.stamps(index))
+
+    def pair(self, index: int, motor_source: MotorSource | None = None) -> FramePair:
+        if motor_source not in self._pairs_by_source:
+            pairs = RecordingPairs(self.recording, self._look_aheads, motor_source=motor_source)
+            self._pairs_by_source[motor_source] = pairs
+        return self._pairs_by_source[motor_source][index]
+
+    def truth(self, index: int) -> TrueFlow:
+        stamps = self.pairs.stamps(index)
+        flow, valid = self.ground_truth.static_flow(*stamps)
+        return TrueFlow(flow, valid if self._movers else valid & (self.ground_truth.instances(stamps[0]) == 0))
+
+
+def spread(truths: Sequence[FlowTruth], max_pairs: int | None) -> list[tuple[FlowTruth, int]]:
+    """(truth, index) of all pairs, or of ``max_pairs`` that are spread evenly over all of them."""
+    chosen = [(truth, index) for truth in truths for index in range(len(truth))]
+    if max_pairs is not None and len(chosen) > max_pairs:
+        chosen = [chosen[k] for k in np.linspace(0, len(chosen) - 1, max_pairs).round().astype(int)]
+    return chosen
