@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from worlds import START_NS, car_world, oxts_text, stamp_text, textured_image, turning_imu, write_lines, write_png
 
-from viflow_anomaly.datasets.simulated_ground_truth import write_flow_png
+from viflow_anomaly.datasets.ground_truth_png import write_flow_png
 
 DRIVE = "2011_09_30_drive_0016"
 FRAME_NS = 103_500_000

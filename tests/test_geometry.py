@@ -14,6 +14,7 @@ from worlds import EUROC
 
 from viflow_anomaly.geometry import (
     integrate_gyro,
+    occluded_pixels,
     pixel_grid,
     project_rays,
     rigid_motion_flow,
@@ -207,3 +208,33 @@ def test_flow_there_and_back_with_distortion() -> None:
         + np.dstack([cv2.remap(back[..., c], landed[:, :1], landed[:, 1:], cv2.INTER_LINEAR) for c in (0, 1)])[:, 0]
     )
     np.testing.assert_allclose(returned, np.column_stack([u, v]), atol=0.02)
+
+
+def test_occluded_pixels_are_those_behind_something_nearer_in_the_target() -> None:
+    """A wall at 4 m; in the target a board at 2 m covers columns 40 to 59; the camera moves 5.5 px to the right."""
+    camera = PinholeCamera(fx=50.0, fy=50.0, cx=49.5, cy=19.5, width=100, height=40)
+    wall = np.full((40, 100), 4.0)
+    target = wall.copy()
+    target[:, 40:60] = 2.0
+    motion = np.eye(4)
+    motion[0, 3] = -0.44  # 5.5 px at 4 m
+    expected = np.zeros((40, 100), dtype=bool)
+    expected[:, 46:65] = True
+    np.testing.assert_array_equal(occluded_pixels(camera, wall, target, motion), expected)
+
+
+@pytest.mark.parametrize("unknown", ["source", "target"])
+def test_unknown_depth_is_not_occluded_and_hides_nothing(unknown: str) -> None:
+    camera = PinholeCamera(fx=50.0, fy=50.0, cx=49.5, cy=19.5, width=100, height=40)
+    depths = {"source": np.full((40, 100), 4.0), "target": np.full((40, 100), 2.0)}
+    depths[unknown][:] = np.inf
+    assert not occluded_pixels(camera, depths["source"], depths["target"], np.eye(4)).any()
+
+
+def test_what_leaves_the_image_or_falls_behind_is_not_occluded() -> None:
+    camera = PinholeCamera(fx=50.0, fy=50.0, cx=49.5, cy=19.5, width=100, height=40)
+    near = np.full((40, 100), 2.0)
+    for shift in ((-10.0, 0.0, 0.0), (0.0, 10.0, 0.0), (0.0, 0.0, -5.0)):
+        motion = np.eye(4)
+        motion[:3, 3] = shift
+        assert not occluded_pixels(camera, 2 * near, near, motion).any()

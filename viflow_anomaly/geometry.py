@@ -141,3 +141,41 @@ def rigid_motion_flow(
     target = project_rays(camera, points[..., :2] / z[..., None])
     flow = np.where(valid[..., None], target - pixels, 0.0)
     return flow.astype(np.float32), valid
+
+
+def occluded_pixels(
+    camera: PinholeCamera,
+    source_depth_m: NDArray[np.floating],
+    target_depth_m: NDArray[np.floating],
+    T_target_source: Float64Array,
+    *,
+    tolerance: float = 0.02,
+) -> NDArray[np.bool_]:
+    """Which pixels of the source show a point that something nearer hides in the target.
+
+    A point counts as hidden when it lies farther than all four pixels around its place in the target say, by more than
+    ``tolerance`` of its depth. Unknown depth (inf) hides nothing; what leaves the image is not hidden.
+
+    Args:
+        camera: of both images.
+        source_depth_m, target_depth_m: [H, W], inf where unknown.
+        T_target_source: [4, 4].
+
+    Returns:
+        [H, W].
+    """
+    height, width = source_depth_m.shape
+    flow, in_front = rigid_motion_flow(camera, source_depth_m, T_target_source)
+    target = np.where(in_front[..., None], pixel_grid(height, width) + flow, -1.0)
+    inside = in_front & (target >= 0).all(-1) & (target[..., 0] <= width - 1) & (target[..., 1] <= height - 1)
+    known = inside & np.isfinite(source_depth_m)
+    rows, columns = np.nonzero(known)
+    rays = np.append(unproject_pixels(camera, np.stack([columns, rows], axis=-1)), np.ones((rows.size, 1)), axis=1)
+    points = rays * source_depth_m[known][:, None]
+    depth = points @ T_target_source[2, :3] + T_target_source[2, 3]
+    left, top = np.floor(target[known]).astype(np.intp).T
+    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    corners = [target_depth_m[v, u] for v in (top, bottom) for u in (left, right)]
+    hidden = np.zeros((height, width), dtype=np.bool_)
+    hidden[known] = depth > np.max(corners, axis=0) * (1 + tolerance)
+    return hidden

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from viflow_anomaly.datasets.simulated_ground_truth import (
-    OBJECT_COLUMNS,
-    MovingObject,
-    SimulatedGroundTruth,
+from viflow_anomaly.datasets.ground_truth_png import (
     read_depth_png,
     read_flow_png,
     write_depth_png,
     write_flow_png,
     write_instances_png,
+    write_mask_png,
 )
+from viflow_anomaly.datasets.simulated_ground_truth import OBJECT_COLUMNS, MovingObject, SimulatedGroundTruth
 from viflow_anomaly.errors import DatasetError
 
 STAMPS = (1_000_000_000, 1_050_000_000, 1_100_000_000)
@@ -239,3 +239,66 @@ def test_unusable_calibration_is_named(root: Path, text: str | None) -> None:
 def test_camera_of_the_sequence(root: Path) -> None:
     camera = SimulatedGroundTruth(root).camera
     assert (camera.fx, camera.cx, camera.width, camera.height) == (50.0, 20.0, 40, 32)
+
+
+def rendered(folder: Path, record: str | None = None) -> SimulatedGroundTruth:
+    """What was rendered for a recording: camera and poses in the folder; depth of the first frame only, half known."""
+    truth = folder / "groundtruth0"
+    (truth / "depth").mkdir(parents=True)
+    depth = np.full((32, 40), 4.0, np.float32)
+    depth[:16] = np.inf
+    write_depth_png(truth / f"depth/{STAMPS[0]}.png", depth)
+    camera = {"fx": 50.0, "fy": 50.0, "cx": 20.0, "cy": 16.0, "width": 40, "height": 32}
+    (truth / "ground_truth.json").write_text(json.dumps({"camera": camera}) if record is None else record)
+    (truth / "poses.csv").write_text(
+        "#pose\n" + "".join(f"{stamp},{0.1 * k},0,0,1,0,0,0\n" for k, stamp in enumerate(STAMPS))
+    )
+    return SimulatedGroundTruth(folder)
+
+
+@pytest.mark.parametrize(("target", "expected"), [(1, -1.25), (2, -2.5)])
+def test_rendered_ground_truth_is_valid_only_where_depth_is_known(tmp_path: Path, target: int, expected: float) -> None:
+    flow, valid = rendered(tmp_path).static_flow(STAMPS[0], STAMPS[target])
+    assert valid[16:].all()
+    assert not valid[:16].any()
+    np.testing.assert_allclose(flow[16:, :, 0], expected, atol=1e-4)
+    assert not flow[:16].any()
+
+
+def test_the_next_frame_is_the_next_pose_not_the_next_depth(tmp_path: Path) -> None:
+    """LiDAR scans belong to every twelfth frame of some drives."""
+    truth = rendered(tmp_path)
+    stored = np.full((32, 40, 2), 3.0, np.float32)
+    (truth.folder / "static_flow").mkdir()
+    write_flow_png(truth.folder / f"static_flow/{STAMPS[0]}.png", stored, np.ones((32, 40), bool))
+    write_depth_png(truth.folder / f"depth/{STAMPS[2]}.png", np.full((32, 40), 4.0, np.float32))
+    assert truth.source_stamps == (STAMPS[0], STAMPS[2])
+    assert truth.static_flow(STAMPS[0], STAMPS[1])[0].min() == 3.0
+    assert truth.static_flow(STAMPS[0], STAMPS[2])[0].min() == pytest.approx(-2.5, abs=1e-4)
+
+
+def test_occluded_is_stored_or_comes_from_both_depths(root: Path) -> None:
+    truth = SimulatedGroundTruth(root)
+    assert not truth.occluded(STAMPS[0], STAMPS[1]).any()
+    near = np.full((32, 40), 4.0, np.float32)
+    near[:, 20:] = 2.0
+    write_depth_png(truth.folder / f"depth/{STAMPS[1]}.png", near)
+    # What goes to columns 19 to 20 is between the two.
+    assert truth.occluded(STAMPS[0], STAMPS[1])[:, 22:].all()
+    assert not truth.occluded(STAMPS[0], STAMPS[1])[:, :21].any()
+    (truth.folder / "occluded").mkdir()
+    mask = np.zeros((32, 40), bool)
+    mask[3, 4] = True
+    write_mask_png(truth.folder / f"occluded/{STAMPS[0]}.png", mask)
+    np.testing.assert_array_equal(truth.occluded(STAMPS[0], STAMPS[1]), mask)
+    with pytest.raises(DatasetError) as raised:
+        truth.occluded(STAMPS[0], STAMPS[2] + 1)
+    assert raised.value.code == "ground_truth_missing"
+
+
+@pytest.mark.parametrize("record", ["{}", "[]", "{", '{"camera": {"fx": 1}}', "[" * 100_000, '"camera"'])
+def test_a_malformed_record_is_named(tmp_path: Path, record: str) -> None:
+    truth = rendered(tmp_path, record)
+    with pytest.raises(DatasetError, match=r"ground_truth\.json") as raised:
+        _ = truth.camera
+    assert raised.value.code == "ground_truth_malformed"

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from viflow_anomaly.datasets.simulated_ground_truth import write_flow_png
+from viflow_anomaly.datasets.ground_truth_png import write_flow_png
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.evaluation.flo_files import write_flo
 from viflow_anomaly.evaluation.flow_methods import NoEstimateError

@@ -14,7 +14,18 @@ from typing import Annotated
 import typer
 from typer.exceptions import TyperException
 
-from viflow_anomaly.cli import batch, configuration, detect, evaluate, export, schema, serve, simulate, train
+from viflow_anomaly.cli import (
+    batch,
+    configuration,
+    detect,
+    evaluate,
+    export,
+    groundtruth,
+    schema,
+    serve,
+    simulate,
+    train,
+)
 from viflow_anomaly.errors import ViflowError
 
 EXIT_BAD_INPUT = 2
@@ -28,7 +39,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="Exit codes: 0 done, 2 bad usage or input, 3 some pairs failed, 130 interrupted.",
 )
-for module in (detect, batch, simulate, train, evaluate, export, serve, schema, configuration):
+for module in (detect, batch, simulate, train, groundtruth, evaluate, export, serve, schema, configuration):
     module.register(app)
 
 

@@ -152,9 +152,9 @@ def read_trajectory(states: Path, cam_yaml: Path) -> Trajectory | None:
         DatasetError: ``csv_malformed`` (also stamps that do not increase, or a quaternion of length 0),
             ``yaml_malformed``, ``calibration_malformed``.
     """
-    if not states.is_file() or not cam_yaml.is_file():
+    T_body_cam = read_T_body_cam(cam_yaml)
+    if T_body_cam is None or not states.is_file():
         return None
-    T_body_cam = _read_T_BS(cam_yaml, _read_yaml(cam_yaml))
     first = next((line.text for line in read_lines(states) if not line.text.startswith("#")), "")
     columns = POSE_COLUMNS if first.count(",") == len(POSE_COLUMNS) - 1 else STATE_COLUMNS
     stamps, values = read_stamped_numbers(states, columns, header="comment")
@@ -176,6 +176,27 @@ def _mounting(cam_yaml: Path, sensor: Mapping[str, Any], imu_yaml: Path) -> Floa
     T_BS_cam = _read_T_BS(cam_yaml, sensor)
     T_BS_imu = _read_T_BS(imu_yaml, _read_yaml(imu_yaml))
     return np.asarray(np.linalg.inv(T_BS_cam) @ T_BS_imu)
+
+
+def read_T_body_cam(cam_yaml: Path) -> Float64Array | None:
+    """The camera's ``T_BS`` [4, 4]; None without the file.
+
+    Raises:
+        DatasetError: ``yaml_malformed``, ``calibration_malformed``.
+    """
+    return _read_T_BS(cam_yaml, _read_yaml(cam_yaml)) if cam_yaml.is_file() else None
+
+
+def read_cloud_pose(path: Path) -> Float64Array:
+    """T_world_cloud [4, 4] from the ``sensor.yaml`` beside a room's point cloud: its ``T_WS`` or ``T_BS``; the identity
+    without the file or the key.
+
+    Raises:
+        DatasetError: ``yaml_malformed``, ``calibration_malformed``.
+    """
+    sensor = _read_yaml(path) if path.is_file() else {}
+    key = next((key for key in ("T_WS", "T_BS") if key in sensor), None)
+    return np.eye(4) if key is None else _read_T_BS(path, {"T_BS": sensor[key]})
 
 
 def _read_T_BS(path: Path, sensor: Mapping[str, Any]) -> Float64Array:

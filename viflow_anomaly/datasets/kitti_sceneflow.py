@@ -30,10 +30,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viflow_anomaly.config import ImageLimits, MotionWindowConfig
+from viflow_anomaly.datasets.ground_truth_png import read_flow_png
 from viflow_anomaly.datasets.kitti_calibration import CalibrationFiles, read_raw_camera
 from viflow_anomaly.datasets.kitti_drives import RawDrive, find_raw_data
 from viflow_anomaly.datasets.kitti_files import forward_speeds, oxts_imu
-from viflow_anomaly.datasets.simulated_ground_truth import read_flow_png
 from viflow_anomaly.datasets.tables import read_text
 from viflow_anomaly.datasets.usable_pairs import Interval, window_fault
 from viflow_anomaly.errors import DatasetError, InvalidInputError

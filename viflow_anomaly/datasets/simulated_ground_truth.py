@@ -1,34 +1,40 @@
-"""Ground truth beside a simulated sequence (``mav0/groundtruth0``): depth, flow, instances, moving objects.
+"""Ground truth in a folder ``groundtruth0``: depth, static flow; of a simulated sequence also masks and movers.
 
-Flow PNGs are KITTI's: 16 bit, three channels, value = 64 * flow + 2^15, third channel 1 where valid. Depth PNGs are
-16 bit, 256 steps a metre, 0 where nothing is hit. See docs/simulator.md. Needs neither mujoco nor torch.
+The simulator's lies in ``mav0`` and takes camera and poses from the files there (docs/simulator.md). What was rendered
+for a recording (docs/ground_truth.md) lies anywhere: ``groundtruth0/ground_truth.json`` has the camera, with its
+distortion, and ``groundtruth0/poses.csv`` the poses. Needs neither mujoco nor torch.
 """
 
 from __future__ import annotations
 
 import csv
 import itertools
+import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
-import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from viflow_anomaly.datasets.camera_json import camera_from_mapping
+from viflow_anomaly.datasets.ground_truth_png import (
+    read_depth_png,
+    read_flow_png,
+    read_instances_png,
+    read_mask_png,
+)
 from viflow_anomaly.errors import DatasetError, InvalidInputError
-from viflow_anomaly.geometry import rigid_motion_flow
+from viflow_anomaly.geometry import occluded_pixels, rigid_motion_flow
 from viflow_anomaly.sensor_data import Float64Array, PinholeCamera, Uint8Array
 
 Float32Array = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 
-FLOW_STEPS_PER_PX = 64.0
-FLOW_ZERO = 2**15
-DEPTH_STEPS_PER_M = 256.0
-UINT16_MAX = 65535
+RECORD_NAME = "ground_truth.json"
+POSES_NAME = "poses.csv"
 OBJECT_COLUMNS = (
     "timestamp_ns",
     "instance_id",
@@ -56,79 +62,6 @@ class MovingObject:
     independent_flow_px: float
 
 
-def _write_png(path: Path, image: NDArray[Any]) -> None:
-    encoded, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    assert encoded
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(data.tobytes())
-    partial.replace(path)
-
-
-def _read_png(path: Path, channels: int, kind: str, dtype: type[np.unsignedinteger[Any]]) -> NDArray[Any]:
-    try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError as err:
-        raise DatasetError(
-            f"{path}: expected a {kind} PNG, cannot read it: {err.strerror}", code="ground_truth_missing"
-        ) from err
-    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-    if image is None:
-        raise DatasetError(
-            f"{path}: expected a {kind} PNG, found {data.size} bytes that are none", code="ground_truth_malformed"
-        )
-    shape = image.shape[2] if image.ndim == 3 else 1
-    if shape != channels or image.dtype != dtype:
-        raise DatasetError(
-            f"{path}: expected a {kind} PNG of {channels} channel(s) of {np.dtype(dtype)}, "
-            f"found {shape} of {image.dtype}",
-            code="ground_truth_malformed",
-        )
-    return np.asarray(image)
-
-
-def write_flow_png(path: Path, flow: Float32Array, valid: BoolArray) -> None:
-    """Store flow [H, W, 2] (px) and validity [H, W]; flow that does not fit (beyond +-512 px) becomes invalid."""
-    steps = np.rint(np.where(np.isfinite(flow), flow, 1e9).astype(np.float64) * FLOW_STEPS_PER_PX + FLOW_ZERO)
-    stored = valid & ((steps >= 0) & (steps <= UINT16_MAX)).all(axis=-1)
-    steps = np.where(stored[..., None], steps, 0)
-    # OpenCV writes channels in the order B, G, R: valid, v, u.
-    channels = np.stack([stored.astype(np.float64), steps[..., 1], steps[..., 0]], axis=-1)
-    _write_png(path, channels.astype(np.uint16))
-
-
-def read_flow_png(path: Path) -> tuple[Float32Array, BoolArray]:
-    """Flow [H, W, 2] float32 in px (0 where invalid) and validity [H, W].
-
-    Raises:
-        DatasetError: ``ground_truth_missing``, ``ground_truth_malformed``.
-    """
-    image = _read_png(path, 3, "KITTI flow", np.uint16)
-    valid = image[..., 0] > 0
-    flow = (image[..., :0:-1].astype(np.float32) - FLOW_ZERO) / FLOW_STEPS_PER_PX
-    return np.where(valid[..., None], flow, np.float32(0)), valid
-
-
-def write_depth_png(path: Path, depth_m: Float32Array) -> None:
-    """Store depth [H, W] in metres; what is not finite or does not fit (256 m) is stored as 0."""
-    steps = np.rint(np.where(np.isfinite(depth_m), depth_m, 0.0).astype(np.float64) * DEPTH_STEPS_PER_M)
-    _write_png(path, np.where((steps >= 1) & (steps <= UINT16_MAX), steps, 0).astype(np.uint16))
-
-
-def read_depth_png(path: Path) -> Float32Array:
-    """Depth [H, W] float32 in metres along the optical axis, inf where nothing was hit.
-
-    Raises:
-        DatasetError: ``ground_truth_missing``, ``ground_truth_malformed``.
-    """
-    image = _read_png(path, 1, "depth", np.uint16)
-    return np.where(image > 0, image.astype(np.float32) / np.float32(DEPTH_STEPS_PER_M), np.float32(np.inf))
-
-
-def write_instances_png(path: Path, instances: Uint8Array) -> None:
-    """Store instance numbers [H, W] uint8 (0 static, 1.. movers)."""
-    _write_png(path, instances)
-
-
 def _rotation(quaternion_wxyz: Float64Array) -> Float64Array:
     w, x, y, z = quaternion_wxyz / np.linalg.norm(quaternion_wxyz)
     return np.array(
@@ -141,10 +74,10 @@ def _rotation(quaternion_wxyz: Float64Array) -> Float64Array:
 
 
 class SimulatedGroundTruth:
-    """Ground truth of one simulated sequence.
+    """Ground truth of one sequence: simulated, or rendered for a recording.
 
     Args:
-        root: the sequence, its ``mav0`` folder, or anything ``find`` accepts.
+        root: the sequence, its ``mav0`` folder, or anything ``find`` accepts: a folder that holds ``groundtruth0``.
 
     Raises:
         DatasetError: ``ground_truth_missing`` when there is none.
@@ -156,8 +89,9 @@ class SimulatedGroundTruth:
         self._mav0 = mav0
         if not self.folder.is_dir():
             raise DatasetError(
-                f"{root}: expected mav0/groundtruth0 of a simulated sequence, found none", code="ground_truth_missing"
+                f"{root}: expected groundtruth0 or mav0/groundtruth0, found none", code="ground_truth_missing"
             )
+        self._is_rendered = (self.folder / RECORD_NAME).is_file()
 
     @classmethod
     def find(cls, root: Path) -> Self | None:
@@ -167,11 +101,13 @@ class SimulatedGroundTruth:
 
     @cached_property
     def camera(self) -> PinholeCamera:
-        """Intrinsics of the (undistorted) images."""
+        """Intrinsics and distortion of the images that depth and flow belong to."""
         return self._calibration[0]
 
     @cached_property
     def _calibration(self) -> tuple[PinholeCamera, Float64Array]:
+        if self._is_rendered:
+            return _recorded_camera(self.folder / RECORD_NAME), np.eye(4)
         path = self._mav0 / "cam0" / "sensor.yaml"
         try:
             sensor = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -189,6 +125,8 @@ class SimulatedGroundTruth:
     def _states(self) -> tuple[NDArray[np.int64], Float64Array]:
         """Stamps [N] and rows [N, 7]: position, quaternion w x y z."""
         path = self._mav0 / "state_groundtruth_estimate0" / "data.csv"
+        if self._is_rendered:
+            path = self.folder / POSES_NAME
         stamps, rows = [], []
         for number, row in _csv_rows(path):
             try:
@@ -209,7 +147,7 @@ class SimulatedGroundTruth:
         index = int(np.searchsorted(stamps, timestamp_ns))
         if index == len(stamps) or stamps[index] != timestamp_ns:
             raise DatasetError(
-                f"{self._mav0}: expected a ground-truth state at {timestamp_ns}, found none",
+                f"{self.folder}: expected a ground-truth pose at {timestamp_ns}, found none",
                 code="ground_truth_missing",
             )
         pose = np.eye(4)
@@ -217,13 +155,14 @@ class SimulatedGroundTruth:
         return np.asarray(pose @ self._calibration[1])
 
     def depth(self, source_ns: int) -> Float32Array:
-        """[H, W] metres, inf where nothing was hit."""
+        """[H, W] metres, inf where nothing was hit (simulated) or nothing is known (rendered for a recording)."""
         return read_depth_png(self.folder / "depth" / f"{source_ns}.png")
 
     def static_flow(self, source_ns: int, target_ns: int) -> tuple[Float32Array, BoolArray]:
         """Flow of the static world [H, W, 2] and validity [H, W] between any two frames.
 
-        The stored PNG for the next frame, else from depth (to 2 mm) and poses. Occluded pixels count as valid.
+        The stored PNG for the next frame, else from depth (to 2 mm) and poses. Occluded pixels and those that leave
+        the image count as valid; so does the simulator's sky, but no pixel whose depth is not known.
 
         Raises:
             DatasetError: ``ground_truth_missing``, ``ground_truth_malformed``.
@@ -231,12 +170,40 @@ class SimulatedGroundTruth:
         stored = self.folder / "static_flow" / f"{source_ns}.png"
         if target_ns == self._next_stamps.get(source_ns) and stored.is_file():
             return read_flow_png(stored)
-        T_target_source = np.linalg.inv(self.camera_pose(target_ns)) @ self.camera_pose(source_ns)
-        return rigid_motion_flow(self.camera, self.depth(source_ns), T_target_source)
+        depth = self.depth(source_ns)
+        flow, valid = rigid_motion_flow(self.camera, depth, self._motion(source_ns, target_ns))
+        if not self._is_rendered:
+            return flow, valid
+        known = valid & np.isfinite(depth)
+        return np.where(known[..., None], flow, np.float32(0)), known
+
+    def occluded(self, source_ns: int, target_ns: int) -> BoolArray:
+        """[H, W]: the point is in the target's image, but behind something nearer (of the static world and, in a
+        simulated sequence, of the movers).
+
+        The stored PNG for the next frame, else from the depth of both frames and the poses.
+
+        Raises:
+            DatasetError: ``ground_truth_missing`` (also where the target has no depth), ``ground_truth_malformed``.
+        """
+        stored = self.folder / "occluded" / f"{source_ns}.png"
+        if target_ns == self._next_stamps.get(source_ns) and stored.is_file():
+            return read_mask_png(stored)
+        depths = self.depth(source_ns), self.depth(target_ns)
+        return occluded_pixels(self.camera, *depths, self._motion(source_ns, target_ns))
+
+    def _motion(self, source_ns: int, target_ns: int) -> Float64Array:
+        return np.asarray(np.linalg.inv(self.camera_pose(target_ns)) @ self.camera_pose(source_ns))
+
+    @cached_property
+    def source_stamps(self) -> tuple[int, ...]:
+        """The frames that have depth, in order of time: static flow can be had from each of them."""
+        return tuple(sorted(int(path.stem) for path in (self.folder / "depth").glob("*.png") if path.stem.isdecimal()))
 
     @cached_property
     def _next_stamps(self) -> dict[int, int]:
-        stamps = sorted(int(path.stem) for path in (self.folder / "depth").glob("*.png"))
+        # Rendered ground truth may lack depth for some frames; every frame that has a pose is in its poses.
+        stamps = self._states[0].tolist() if self._is_rendered else self.source_stamps
         return dict(itertools.pairwise(stamps))
 
     def flow(self, source_ns: int) -> tuple[Float32Array, BoolArray]:
@@ -245,8 +212,7 @@ class SimulatedGroundTruth:
 
     def instances(self, source_ns: int) -> Uint8Array:
         """[H, W] uint8: 0 the static world, 1.. movers."""
-        image = _read_png(self.folder / "instances" / f"{source_ns}.png", 1, "instance", np.uint8)
-        return np.asarray(image, dtype=np.uint8)
+        return read_instances_png(self.folder / "instances" / f"{source_ns}.png")
 
     def objects(self, source_ns: int) -> list[MovingObject]:
         """The movers that show in a frame, in order of their number; empty for the last frame (it has no flow)."""
@@ -263,6 +229,16 @@ class SimulatedGroundTruth:
                 raise _malformed(path, number, ",".join(OBJECT_COLUMNS), row) from err
             found.setdefault(thing.timestamp_ns, []).append(thing)
         return found
+
+
+def _recorded_camera(path: Path) -> PinholeCamera:
+    try:
+        return camera_from_mapping(json.loads(path.read_bytes())["camera"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, InvalidInputError) as err:
+        raise DatasetError(
+            f"{path}: expected the record of rendered ground truth with its camera, found {err!r:.200}",
+            code="ground_truth_malformed",
+        ) from err
 
 
 def _state_of(row: list[str]) -> tuple[int, list[float]]:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from viflow_anomaly.config import MotorSource
-from viflow_anomaly.datasets.simulated_ground_truth import read_flow_png
+from viflow_anomaly.datasets.ground_truth_png import read_flow_png
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.evaluation.flo_files import read_flo
 from viflow_anomaly.evaluation.flow_methods import MethodAbout, NoEstimateError
