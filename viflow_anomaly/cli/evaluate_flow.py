@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from viflow_anomaly.evaluation.flow_run import FlowMeasurement
     from viflow_anomaly.evaluation.flow_tables import Table
     from viflow_anomaly.evaluation.flow_truth import FlowTruth, RecordingTruth
+    from viflow_anomaly.evaluation.sceneflow_truth import SceneFlowTruth
     from viflow_anomaly.settings import Settings
 
 DEFAULT, NONE = "default", "none"
@@ -26,7 +27,7 @@ DEFAULT, NONE = "default", "none"
 
 def flow(
     recordings: Annotated[
-        list[Path], typer.Argument(metavar="DIR...", help="Recordings with ground truth, one a folder.")
+        list[Path], typer.Argument(metavar="DIR...", help="Recordings with ground truth, or KITTI scene flow 2015.")
     ],
     checkpoint: Annotated[
         list[str] | None,
@@ -179,9 +180,10 @@ def _named(text: str) -> tuple[str | None, str]:
 
 def _truths(
     recordings: Sequence[Path], look_aheads: Sequence[int], ground_truth: Path | None, movers: bool
-) -> Sequence[RecordingTruth]:
+) -> Sequence[RecordingTruth | SceneFlowTruth]:
     from viflow_anomaly.errors import ConfigError
     from viflow_anomaly.evaluation.flow_truth import RecordingTruth
+    from viflow_anomaly.evaluation.sceneflow_truth import is_scene_flow, open_scene_flow
 
     if ground_truth is not None and len(recordings) != 1:
         raise ConfigError(
@@ -189,12 +191,18 @@ def _truths(
             code="ground_truth_ambiguous",
             field="ground_truth",
         )
-    return [RecordingTruth(path, look_aheads, ground_truth=ground_truth, movers=movers) for path in recordings]
+    truths: list[RecordingTruth | SceneFlowTruth] = []
+    for path in recordings:
+        if is_scene_flow(path):
+            truths += open_scene_flow(path, movers=movers)
+        else:
+            truths.append(RecordingTruth(path, look_aheads, ground_truth=ground_truth, movers=movers))
+    return truths
 
 
-def _test_parts(truths: Sequence[RecordingTruth], settings: Settings) -> Sequence[FlowTruth]:
+def _test_parts(truths: Sequence[RecordingTruth | SceneFlowTruth], settings: Settings) -> Sequence[FlowTruth]:
     from viflow_anomaly.errors import ConfigError
-    from viflow_anomaly.evaluation.flow_truth import TestPart
+    from viflow_anomaly.evaluation.flow_truth import RecordingTruth, TestPart
 
     split = settings.training.split
     if split.rule == "none":
@@ -203,7 +211,7 @@ def _test_parts(truths: Sequence[RecordingTruth], settings: Settings) -> Sequenc
             code="split_rule_unknown",
             field="training.split.rule",
         )
-    return [TestPart(truth, split) for truth in truths]
+    return [TestPart(truth, split) if isinstance(truth, RecordingTruth) else truth for truth in truths]
 
 
 def _baselines(text: str) -> tuple[list[FlowMethod], list[str]]:

@@ -29,17 +29,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from viflow_anomaly.config import ImageLimits, MotionWindowConfig
+from viflow_anomaly.config import ImageLimits, MotionWindowConfig, MotorSource
 from viflow_anomaly.datasets.ground_truth_png import read_flow_png
 from viflow_anomaly.datasets.kitti_calibration import CalibrationFiles, read_raw_camera
 from viflow_anomaly.datasets.kitti_drives import RawDrive, find_raw_data
-from viflow_anomaly.datasets.kitti_files import forward_speeds, oxts_imu
+from viflow_anomaly.datasets.kitti_files import OxtsRow, forward_speeds, oxts_imu
+from viflow_anomaly.datasets.kitti_poses import oxts_trajectory
 from viflow_anomaly.datasets.tables import read_text
 from viflow_anomaly.datasets.usable_pairs import Interval, window_fault
 from viflow_anomaly.errors import DatasetError, InvalidInputError
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.images import read_image
-from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples, PinholeCamera, Uint8Array
+from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples, Int64Array, PinholeCamera, Uint8Array
 
 PAPER_WINDOW = MotionWindowConfig(layout="paper_kitti", axes="sensor")
 BEFORE_NS, AFTER_NS = 120_000_000, 20_000_000
@@ -53,6 +54,7 @@ class _Usable(NamedTuple):
     interval: Interval
     imu: ImuSamples
     motor_command: NDArray[np.float64]
+    oxts: tuple[Int64Array, list[OxtsRow]]
 
 
 class KittiSceneFlow:
@@ -122,12 +124,17 @@ class KittiSceneFlow:
         """The raw drive, ``2011_09_26_drive_0005``."""
         return self._pairs[index].drive.name
 
-    def pair(self, index: int) -> FramePair:
-        """Both images, the 100 Hz IMU around them, the camera, the forward speed.
+    def stamps(self, index: int) -> tuple[int, int]:
+        """(source, target) stamps in nanoseconds."""
+        return self._pairs[index].interval
+
+    def pair(self, index: int, motor_source: MotorSource | None = "command") -> FramePair:
+        """Both images, the 100 Hz IMU around them, the camera, the forward speed or the camera's displacement.
 
         Raises:
             IndexError: outside.
-            DatasetError: ``image_missing``, ``calibration_malformed``.
+            DatasetError: ``image_missing``, ``calibration_malformed``; for a displacement ``trajectory_missing`` (the
+                mounting is unknown) and ``trajectory_not_covering``.
             InvalidInputError: as ``images.read_image`` and ``FramePair``.
         """
         found = self._pairs[index]
@@ -138,7 +145,19 @@ class KittiSceneFlow:
         )
         height, width = source.image.shape
         camera = self._camera(found, (width, height))
-        return FramePair(source, target, found.imu, camera, found.motor_command)
+        command = self._displacement(found, camera) if motor_source == "displacement" else found.motor_command
+        return FramePair(source, target, found.imu, camera, command)
+
+    def _displacement(self, found: _Usable, camera: PinholeCamera | None) -> NDArray[np.float64]:
+        origin = f"{found.drive.name} around image {found.number:06d}"
+        trajectory = oxts_trajectory(*found.oxts, None if camera is None else camera.T_cam_imu, origin)
+        if trajectory is None:
+            raise DatasetError(
+                f"{origin}: expected the IMU's mounting on the camera, to say how far it moved, found none",
+                code="trajectory_missing",
+                field="motor_command",
+            )
+        return trajectory.displacement_m(*found.interval)
 
     def truth(self, index: int) -> tuple[Float32Array, NDArray[np.bool_]]:
         """Flow [H, W, 2] in px from source to target (0 where unknown), and where it is known [H, W].
@@ -217,4 +236,4 @@ def _find(number: int, drive: RawDrive, frame: int, window: MotionWindowConfig) 
     if fault is not None:
         return fault
     speed = forward_speeds(np.array([interval.source_ns]), imu_stamps, rows)[0]
-    return _Usable(number, drive, interval, imu, speed)
+    return _Usable(number, drive, interval, imu, speed, (imu_stamps, rows))
