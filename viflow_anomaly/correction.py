@@ -41,6 +41,7 @@ class Correction(NamedTuple):
     Attributes:
         flow_px: [h, w, 2] float32.
         motion: the corrected camera motion, None where the network gives flow only.
+        inverse_depth: [h, w] as refined, None where the network gives flow only.
         inlier_share: confident cells that agree with ``flow_px``, 0..1; 0 where too little was confident.
         shift_px: how far the correction moved the prediction, |du| + |dv|, mean over cells.
         converged: False: nothing to measure, or the prediction was no worse; it stands as it was.
@@ -51,6 +52,7 @@ class Correction(NamedTuple):
     inlier_share: float
     shift_px: float
     converged: bool
+    inverse_depth: Float32Array | None = None
 
 
 def rigid_flow_px(
@@ -114,15 +116,14 @@ def correct_motion(
         motion = RigidMotion(so3_exp(step[:3]) @ motion.rotation, motion.translation + step[3:])
     before = rigid_flow_px(rays, inverse_depth, start, focal_px)
     after = rigid_flow_px(rays, inverse_depth, motion, focal_px)
-    corrected = _accepted(before, after, measured, config, start, motion)
+    corrected = _accepted(before, after, measured, config, start, motion)._replace(inverse_depth=inverse_depth)
     if not corrected.converged or not config.depth_rounds:
         return corrected
     refined = _refined_depth(rays, inverse_depth, motion, measured, focal_px, config)
     flow_px = rigid_flow_px(rays, refined, motion, focal_px)
     share, _ = _inlier_share(flow_px, measured, config)
-    return corrected._replace(
-        flow_px=flow_px, inlier_share=share, shift_px=_shift_px(before, flow_px, measured, config)
-    )
+    shift_px = _shift_px(before, flow_px, measured, config)
+    return corrected._replace(flow_px=flow_px, inlier_share=share, shift_px=shift_px, inverse_depth=refined)
 
 
 def _refined_depth(
