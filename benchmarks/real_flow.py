@@ -1,9 +1,9 @@
 """The reproduction's networks on real recordings that none of them was trained on.
 
 KITTI drives with LiDAR: endpoint error against the sparse flow of scans moved by the OXTS (``groundtruth kitti``),
-every row of the car beside the classical methods. EuRoC: no depth is known there, so the *photometric* error is measured
-instead: mean absolute difference between the source image and its reconstruction, over that of the frames as they are
-(no motion), for every row of the drone.
+every row of the car beside the classical methods. EuRoC: no depth is known there, so the *photometric* error is
+measured instead: mean absolute difference between the source image and its reconstruction, over that of the frames as
+they are (no motion), for every row of the drone.
 
     python benchmarks/real_flow.py --data runs/reproduction --out benchmarks/results/reproduction
 """
