@@ -12,16 +12,30 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from simulated_truth import add_ground_truth
 from worlds import car_world, make_world, write_euroc, write_kitti_raw, write_lines, write_plain
 
+from viflow_anomaly import prediction
 from viflow_anomaly.batch import collate
 from viflow_anomaly.checkpoint import load_checkpoint, save_checkpoint
 from viflow_anomaly.cli.main import run
-from viflow_anomaly.config import ModelConfig, MotionInputs, MotionWindowConfig, MotorConfig, TrainingConfig, ViewConfig
+from viflow_anomaly.config import (
+    CorrectionConfig,
+    ModelConfig,
+    MotionInputs,
+    MotionWindowConfig,
+    MotorConfig,
+    TrainingConfig,
+    ViewConfig,
+)
+from viflow_anomaly.correction import RigidMotion, rigid_flow_px
 from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.datasets.registry import open_recording
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import ConfigError, DatasetError, InvalidInputError
+from viflow_anomaly.evaluation.endpoint_error import require_ground_truth
+from viflow_anomaly.geometry import so3_exp
+from viflow_anomaly.measured_flow import MeasuredFlow
 from viflow_anomaly.model.builder import build_model
 from viflow_anomaly.model_input import prepare
 from viflow_anomaly.motor_input import (
@@ -32,7 +46,9 @@ from viflow_anomaly.motor_input import (
     nearest_cluster,
     require_supported,
 )
+from viflow_anomaly.prediction import correct, view_rays
 from viflow_anomaly.runtime.export import export_onnx
+from viflow_anomaly.runtime.interface import Hypotheses
 from viflow_anomaly.runtime.loading import load_runtime
 from viflow_anomaly.sensor_data import FramePair
 from viflow_anomaly.training import train
@@ -172,7 +188,7 @@ def test_more_clusters_than_displacements_are_refused() -> None:
 
 def test_a_command_that_never_changes_is_standardised_without_a_division_by_zero() -> None:
     fitted = fitted_motor(np.full((5, 2), 3.0), config("motor", MotorConfig()), seed=0)
-    assert np.isfinite(encode(np.full((1, 2), 3.0), np.array([0.1]), fitted)).all()
+    np.testing.assert_allclose(encode(np.full((1, 2), 3.02), np.array([0.1]), fitted), 0.02, atol=1e-6)
 
 
 # --- from recordings
@@ -218,14 +234,42 @@ def test_a_mirrored_pair_has_a_mirrored_displacement(tmp_path: Path) -> None:
 # --- networks
 
 
-@pytest.mark.parametrize("preset", ["compact", "calibrated"])
-@pytest.mark.parametrize("inputs", ["sffms", "imu+sffms"])
+@pytest.mark.parametrize(
+    ("preset", "inputs"), [("compact", "sffms"), ("compact", "imu+sffms"), ("calibrated", "imu+sffms")]
+)
 def test_the_motor_stream_moves_the_flow(preset: str, inputs: MotionInputs) -> None:
     network = build_model(config(inputs, preset=preset), seed=0)
     source, motion, interval_s = torch.rand(2, 1, 64, 64), torch.zeros(2, WINDOW.rows, 6), torch.full((2,), 0.1)
     with torch.no_grad():
         flow = network(source[:1].repeat(2, 1, 1, 1), motion, interval_s, torch.eye(3)[:2]).flow_px
     assert not torch.allclose(flow[0], flow[1])
+
+
+def test_a_rotation_that_nobody_knows_is_found_on_the_target_image(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A turn of 50 mrad that little was measured of: the prior of a gyro that was seen would hold it back."""
+    model = config("sffms", hypotheses=1)
+    one = prepare(pair_with(tmp_path, np.zeros(3)), model)
+    assert not one.rotation_known
+    rows, columns = (side // 4 for side in one.source.shape)
+    rays = view_rays(rows, columns, 4, *one.source.shape, one.view.focal_px)
+    turn = RigidMotion(so3_exp(np.array([0.0, 0.05, 0.0])), np.zeros(3))
+    flow = rigid_flow_px(rays, np.ones((rows, columns), np.float32), turn, one.view.focal_px)
+    seen = MeasuredFlow(flow, np.full((rows, columns), 0.01, np.float32), 4)
+    monkeypatch.setattr(prediction, "measure_flow", lambda *_, **__: seen)
+    still = Hypotheses(np.zeros((1, rows, columns, 2), np.float32), 4, None)
+    unknown, known = (
+        correct(still, replace(one, rotation_known=known), CorrectionConfig(), focal_px=80.0).flow_px
+        for known in (False, True)
+    )
+    assert np.abs(unknown - flow).mean() < 0.1
+    assert np.abs(known - flow).mean() > 0.5
+
+
+def test_a_calibrated_model_needs_the_gyro() -> None:
+    with pytest.raises(ValueError, match="one with 'imu' for the preset 'calibrated'"):
+        config("sffms", preset="calibrated")
 
 
 def test_without_an_imu_stream_the_imu_changes_nothing() -> None:
@@ -284,6 +328,26 @@ def test_the_codebook_is_fitted_on_the_training_split_and_kept_in_the_checkpoint
     assert detector.detect(pairs[0]).status == "ok"
     with pytest.raises(InvalidInputError) as raised:
         detector.detect(replace(pairs[0], motor_command=None))
+    assert raised.value.code == "motor_command_missing"
+
+
+def test_a_resumed_run_keeps_its_codebook(tmp_path: Path) -> None:
+    """The recording grew since: clusters fitted anew would be other inputs than the weights were trained with."""
+    folder = write_moving(tmp_path / "a", frames=5)
+    wanted = config("imu+sffms", MotorConfig(clusters=3))
+    first = load_checkpoint(train([folder], tmp_path / "run", model=wanted, training=TRAINING, progress=False))[1]
+    (tmp_path / "run" / "model.safetensors").unlink()
+    write_moving(tmp_path / "b" / "a", frames=9, seed=3)
+    again = train(
+        [tmp_path / "b" / "a"], tmp_path / "run", model=wanted, training=TRAINING, progress=False, resume=True
+    )
+    assert load_checkpoint(again)[1].model == first.model
+
+
+def test_a_validation_recording_without_commands_is_found_before_the_training(tmp_path: Path) -> None:
+    folder = add_ground_truth(tmp_path / "drone_1", make_world(frames=3))
+    with pytest.raises(InvalidInputError) as raised:
+        require_ground_truth([folder], config("imu+motor", SPEED))
     assert raised.value.code == "motor_command_missing"
 
 

@@ -179,6 +179,15 @@ class ModelConfig(FrozenConfig):
             )
         return self
 
+    @model_validator(mode="after")
+    def _rotation_comes_from_the_gyro(self) -> Self:
+        if self.preset == "calibrated" and not self.uses_imu:
+            raise ValueError(
+                "motion_inputs: expected one with 'imu' for the preset 'calibrated', whose rotation is the gyro's, "
+                f"found {self.motion_inputs!r}"
+            )
+        return self
+
 
 MIN_SOFTENING_GRAY = 0.1
 
@@ -281,7 +290,7 @@ class TrainingConfig(FrozenConfig):
     relaxation: float = Field(default=0.05, ge=0, lt=1, description="weight of the mean over hypotheses")
     look_aheads: tuple[int, ...] = (1, 2)
     split: SplitConfig = SplitConfig()
-    seed: int = 0
+    seed: int = Field(default=0, ge=0, le=2**63 - 1)
     validate_every: PositiveInt = 1000
     checkpoint_every: PositiveInt = 500
     threads: int = Field(default=1, ge=1, le=MAX_THREADS)

@@ -2,7 +2,8 @@
 
 A few rounds of iteratively reweighted least squares bring the network's prediction to the measured flow of the view.
 What moves by itself, and what was measured wrongly, is outvoted by robust weights; a prior keeps the rotation near the
-gyro's. The parameters are few (six, or a dozen), so independent motion cannot be explained away.
+gyro's. The parameters are few (six, or a dozen), so independent motion cannot be explained away by them. The depth that
+follows (``depth_refinement``) has one number a cell: it takes up a part of a motion along the epipolar line.
 """
 
 from __future__ import annotations

@@ -3,6 +3,9 @@
 The network reads one inverse depth a cell from a single image; how wrong it is there shows in the part of the measured
 flow that lies along the cell's own epipolar line, where a static point may move. What the measurement says beside that
 line is nobody's depth: it stays an anomaly. Depth is smooth and the measurement noisy, so neighbours vote together.
+
+The price: of a mover that moves along the epipolar line (a car ahead on one's own road) a part is taken for nearness, a
+quarter to a half of a few pixels. On held-out sequences the gain is larger: fewer alarms from parallax.
 """
 
 from __future__ import annotations

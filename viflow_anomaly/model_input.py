@@ -21,6 +21,7 @@ class ModelInput:
         window: its ``values`` are [T, 6].
         view: how the views came from the source image.
         motor: [M] for the network's motor stream, None where it has none.
+        rotation_known: the network sees the gyro; without, it predicts no rotation.
     """
 
     source: Uint8Array
@@ -28,6 +29,7 @@ class ModelInput:
     window: MotionWindow
     view: InternalView
     motor: Float32Array | None = None
+    rotation_known: bool = True
 
 
 def prepare(pair: FramePair, config: ModelConfig) -> ModelInput:
@@ -40,4 +42,5 @@ def prepare(pair: FramePair, config: ModelConfig) -> ModelInput:
     view = make_view(config.view, width=width, height=height, camera=pair.camera)
     window = build_motion_window(pair, config.motion_window)
     motor = motor_input(pair, config)
-    return ModelInput(view.render(pair.source.image), view.render(pair.target.image), window, view, motor)
+    source, target = (view.render(frame.image) for frame in (pair.source, pair.target))
+    return ModelInput(source, target, window, view, motor, rotation_known=config.uses_imu)

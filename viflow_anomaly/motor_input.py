@@ -21,6 +21,8 @@ MIRRORED_DISPLACEMENT_SIGNS = (-1, 1, 1)
 """Left and right exchanged in the camera's axes."""
 INTERVALS_PER_UNIT = 10.0
 """Intervals are fed in tenths of a second, so that they are near 1, as everywhere in the networks."""
+MIN_DEVIATION = 1e-6
+"""Of a command over its size: what varied less did not vary, and is not blown up when it does one day."""
 KMEANS_STARTS = 8
 KMEANS_ITERATIONS = 50
 
@@ -121,12 +123,13 @@ def fitted_motor(commands: Float64Array, config: ModelConfig, *, seed: int) -> M
     """``config`` with the motor stream's values fitted to the training pairs' commands [P, C].
 
     Raises:
-        ConfigError: ``config_invalid``: fewer different displacements than clusters.
+        ConfigError: ``config_invalid``: fewer different displacements than clusters, or clusters that stay empty.
     """
     if config.motor_source == "displacement":
         values = {"centroids_m": _kmeans(commands, config.motor.clusters, seed=seed)}
     else:
-        deviation = np.maximum(commands.std(axis=0), 1e-6)
+        deviation = commands.std(axis=0)
+        deviation[deviation < MIN_DEVIATION * np.maximum(np.abs(commands).max(axis=0), 1)] = 1.0
         values = {"mean": tuple(commands.mean(axis=0).tolist()), "deviation": tuple(deviation.tolist())}
     return config.model_copy(update={"motor": MotorConfig.model_validate({**config.motor.model_dump(), **values})})
 
@@ -143,7 +146,7 @@ def _kmeans(displacements_m: Float64Array, clusters: int, *, seed: int) -> tuple
             code="config_invalid",
             field="model.motor.clusters",
         )
-    best, lowest = np.unique(displacements_m, axis=0)[:clusters], np.inf
+    best, lowest = None, np.inf
     for start in range(KMEANS_STARTS):
         rng = np.random.default_rng([seed, start])
         try:
@@ -153,5 +156,12 @@ def _kmeans(displacements_m: Float64Array, clusters: int, *, seed: int) -> tuple
         error = np.square(displacements_m[:, None] - centroids).sum(axis=-1).min(axis=1).mean()
         if error < lowest:
             best, lowest = centroids, error
+    if best is None:
+        raise ConfigError(
+            f"model.motor.clusters: expected {clusters} clusters that all keep a displacement, found none in "
+            f"{KMEANS_STARTS} starts of K-means",
+            code="config_invalid",
+            field="model.motor.clusters",
+        )
     order = np.lexsort(best.T[::-1])
     return tuple(tuple(row) for row in best[order].tolist())

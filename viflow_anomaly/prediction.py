@@ -19,6 +19,8 @@ from viflow_anomaly.sensor_data import Uint8Array
 SELECTION_STRIDE_PX = 4
 """Hypotheses compete on pictures shrunk this far, as in training."""
 CHARBONNIER_EPSILON = 0.01
+UNKNOWN_ROTATION_SIGMA_RAD = 0.3
+"""The prior of the correction where no gyro was seen: none to speak of."""
 
 
 class PredictedFlow(NamedTuple):
@@ -68,6 +70,8 @@ def correct(
     measured = measure_flow(model_input.source, model_input.target, stride=stride, around=predicted)
     scene = hypotheses.scene
     focal_px = model_input.view.focal_px if scene is None else focal_px  # a scene's flow is in the network's own
+    if not model_input.rotation_known:
+        config = config.model_copy(update={"rotation_sigma_rad": UNKNOWN_ROTATION_SIGMA_RAD})
     rays = view_rays(*predicted.shape[:2], stride, *model_input.source.shape, focal_px)
     if scene is None:
         correction = correct_flow(rays, hypotheses.flow_px, winner, measured, focal_px, config)

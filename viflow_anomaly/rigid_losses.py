@@ -58,7 +58,7 @@ def _corrected(
     scene: RigidScene, winners: torch.Tensor, batch: Batch, rays: torch.Tensor, focal_px: float
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Rotation [B, 3, 3], translation [B, 3] and whether the correction converged [B], without gradient."""
-    config = CorrectionConfig()
+    config = CorrectionConfig(depth_rounds=0)  # only the motion is wanted
     rays_of_cells = np.ascontiguousarray(rays[0].permute(1, 2, 0).cpu().numpy())
     depth = scene.inverse_depth.detach().float().cpu().numpy()[:, 0]
     rotations = scene.rotation.detach().double().cpu().numpy()

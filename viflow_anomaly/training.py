@@ -20,7 +20,7 @@ from viflow_anomaly import __version__
 from viflow_anomaly.batch import Batch, require_device
 from viflow_anomaly.checkpoint import load_training_state, save_checkpoint, save_training_state
 from viflow_anomaly.checkpoint_record import source_commit
-from viflow_anomaly.config import ModelConfig, TrainingConfig, loss_of_preset
+from viflow_anomaly.config import ModelConfig, MotorConfig, TrainingConfig, loss_of_preset
 from viflow_anomaly.errors import CheckpointError, ConfigError
 from viflow_anomaly.evaluation.endpoint_error import EndpointErrors, measure_endpoint_errors, require_ground_truth
 from viflow_anomaly.losses import LossResult, photometric_loss, squared_error_loss
@@ -95,7 +95,8 @@ class TrainingRun:
         tensors = {f"model.{key}": value for key, value in self.network.state_dict().items()}
         for index, state in self.optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{index}.{key}": torch.as_tensor(value) for key, value in state.items()}
-        save_training_state(folder, tensors, {"step": self.step, **fingerprint})
+        fitted = {"motor": self.model_config.motor.model_dump(mode="json")}
+        save_training_state(folder, tensors, {"step": self.step, **fitted, **fingerprint})
 
     def restore(self, folder: Path, fingerprint: Mapping[str, Any]) -> bool:
         """Take up the state in ``folder``; False where there is none.
@@ -197,7 +198,7 @@ def train(
     """
     require_device(device)
     loss = _loss_name(model, training)
-    require_ground_truth(validation)
+    require_ground_truth(validation, model)
     torch.set_num_threads(training.threads)
     data = sorted(data, key=lambda path: (path.name, path))  # what a step draws depends on their order
     fingerprint = {
@@ -206,7 +207,7 @@ def train(
         "recordings": [path.name for path in data],
         "validation": sorted(path.name for path in validation),
     }
-    first_step = _first_step(out_dir, fingerprint, resume=resume)
+    first_step, model = _going_on(out_dir, fingerprint, model, resume=resume)
     with TrainingProgress(out_dir, steps=training.steps, first_step=first_step, visible=progress) as reporter:
         training_data = load_training_data(
             data,
@@ -240,20 +241,29 @@ def train(
     return save_checkpoint(path, run.network, run.model_config, name=name, version=__version__, provenance=provenance)
 
 
-def _first_step(out_dir: Path, fingerprint: Mapping[str, Any], *, resume: bool) -> int:
-    """Where a run goes on: found out before minutes of loading, as is a state that it cannot go on from."""
+def _going_on(
+    out_dir: Path, fingerprint: Mapping[str, Any], model: ModelConfig, *, resume: bool
+) -> tuple[int, ModelConfig]:
+    """At which step a run goes on, and its model with the motor stream as it was fitted when the run began.
+
+    Found out before minutes of loading, as is a state that it cannot go on from.
+    """
     loaded = load_training_state(out_dir)
     if loaded is None:
-        return 0
+        return 0, model
     if not resume:
         raise ConfigError(
             f"{out_dir}: expected a directory without a training run, found one; --resume goes on with it",
             code="training_exists",
             field="out",
         )
-    _require_same_run(out_dir, loaded[1], fingerprint)
-    step = loaded[1].get("step")
-    return step if isinstance(step, int) else 0
+    record = loaded[1]
+    _require_same_run(out_dir, record, fingerprint)
+    step = record.get("step")
+    if "motor" in record:
+        motor = MotorConfig.from_mapping(record["motor"], where=str(out_dir / "state.safetensors"))
+        model = model.model_copy(update={"motor": motor})
+    return step if isinstance(step, int) else 0, model
 
 
 def _run_steps(

@@ -72,7 +72,14 @@ def test_random_uses_every_pair_once(
     assert split.straddling == []
     assert split.train == sorted(split.train)
     assert split.test == sorted(split.test)
-    assert abs(len(split.test) - share * len(pairs)) < 1
+
+
+def test_a_random_split_keeps_its_share_and_knows_no_look_aheads(recording: FileRecording) -> None:
+    near, far = (RecordingPairs(steady(recording, 2000, 20.0), look_aheads) for look_aheads in ((1,), (1, 2, 4)))
+    tested = [{pairs.stamps(k) for k in split_pairs(pairs, "random", seed=5).test} for pairs in (near, far)]
+    assert tested[0] < tested[1]
+    assert {one for one in tested[1] if one in {near.stamps(k) for k in range(len(near))}} == tested[0]
+    assert abs(len(tested[1]) / len(far) - 0.2) < 0.02
 
 
 @pytest.mark.parametrize("rate_hz", [10.0, 20.0])

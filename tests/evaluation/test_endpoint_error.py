@@ -149,8 +149,11 @@ def refusal(folder: Path, *, at_once: bool) -> DatasetError:
     def measure(folders: list[Path]) -> None:
         measured(ConstantFlow((0.0, 0.0)), config_of(FOCAL_PX), folders)
 
+    def require_at_once(folders: list[Path]) -> None:
+        require_ground_truth(folders, config_of(FOCAL_PX))
+
     with pytest.raises(DatasetError, match=folder.name) as raised:
-        (require_ground_truth if at_once else measure)([folder])
+        (require_at_once if at_once else measure)([folder])
     return raised.value
 
 
@@ -182,5 +185,5 @@ def test_ground_truth_without_a_valid_pixel(tmp_path: Path) -> None:
 
 
 def test_ground_truth_that_is_there(drone: Path) -> None:
-    require_ground_truth([])
-    require_ground_truth([drone, drone / "mav0"])
+    require_ground_truth([], ModelConfig())
+    require_ground_truth([drone, drone / "mav0"], ModelConfig())

@@ -6,7 +6,8 @@ and a pair belongs to a part only if both its frames do; one whose frames lie in
 ``random``, the paper's rule [Datasets]: pairs are drawn one by one. Neighbouring pairs share frames, and with
 look-aheads up to four the same frame may be in both parts many times: what is measured on such a test is flattered.
 
-Either depends on the recording's name and frames and on the seed only: not on what other recordings there are.
+Either depends on the recording's name and frames and on the seed only: not on what other recordings or look-aheads
+there are.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def split_pairs(
         pairs: of one recording.
         rule: ``blocks`` or ``random``.
         seed: from 0 up.
-        test_share: of the blocks (``blocks``) or pairs (``random``), above 0 and below 1.
+        test_share: of the blocks (``blocks``), or the chance of each pair (``random``); above 0 and below 1.
         block_s: length of a block in seconds of the camera's clock, counted from the first frame.
 
     Raises:
@@ -57,9 +58,8 @@ def split_pairs(
     _check(rule, test_share, block_s)
     rng = _generator(pairs.recording.name, seed)
     if rule == "random":
-        tested = set(rng.permutation(len(pairs))[: _share_of(len(pairs), test_share, rng)].tolist())
-        indices = range(len(pairs))
-        return Split([k for k in indices if k not in tested], [k for k in indices if k in tested], [])
+        tested = [_lot(pairs.recording.name, seed, *pairs.stamps(k)) < test_share for k in range(len(pairs))]
+        return Split([k for k, one in enumerate(tested) if not one], [k for k, one in enumerate(tested) if one], [])
     is_test = _tested_frames(pairs.recording.frame_timestamps_ns, rng, test_share, block_s)
     split = Split([], [], [])
     for index, (source, target) in enumerate(pairs.indices):
@@ -91,6 +91,12 @@ def _generator(name: str, seed: int) -> np.random.Generator:
     """Python's own hash of a text changes from process to process."""
     digest = hashlib.sha256(name.encode()).digest()
     return np.random.default_rng([seed, int.from_bytes(digest[:8], "big")])
+
+
+def _lot(name: str, seed: int, source_ns: int, target_ns: int) -> float:
+    """A number in 0..1 of one pair's own: the same whatever other pairs there are (look-aheads)."""
+    digest = hashlib.sha256(f"{seed} {source_ns} {target_ns} {name}".encode()).digest()
+    return int.from_bytes(digest[:8], "big") / 2**64
 
 
 def _share_of(count: int, share: float, rng: np.random.Generator) -> int:

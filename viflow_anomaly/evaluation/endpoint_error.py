@@ -18,6 +18,7 @@ from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.evaluation.flow_truth import FlowTruth, RecordingTruth, spread
 from viflow_anomaly.geometry import Float32Array, pixel_grid
 from viflow_anomaly.model_input import prepare
+from viflow_anomaly.motor_input import require_command
 from viflow_anomaly.prediction import predict_flow
 from viflow_anomaly.runtime.interface import Runtime
 
@@ -101,14 +102,19 @@ def measure_endpoint_errors(
     return EndpointErrors(tuple(errors))
 
 
-def require_ground_truth(recordings: Sequence[Path]) -> None:
+def require_ground_truth(recordings: Sequence[Path], model: ModelConfig) -> None:
     """Find out before a long training, not after it, that a recording cannot be measured on.
 
     Raises:
-        DatasetError: as ``measure_endpoint_errors``; only the ground truth of the first pair is read.
+        DatasetError: as ``measure_endpoint_errors``; only the first pair and its ground truth are read.
+        InvalidInputError: the pair cannot be read, or lacks the motor command that the model wants.
     """
     for path in recordings:
-        RecordingTruth(path).truth(0)
+        truth = RecordingTruth(path)
+        truth.truth(0)
+        pair = truth.pair(0, model.motor_source)
+        if model.motor_source is not None:
+            require_command(pair.motor_command, model)
 
 
 def _pair_error(

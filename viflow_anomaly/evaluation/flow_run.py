@@ -19,6 +19,8 @@ from viflow_anomaly.sensor_data import FramePair
 
 ByMethod = dict[str, FlowStatistics]
 NO_TRUTH = "no_valid_ground_truth"
+NO_PAIR = ("trajectory_not_covering", "image_missing")
+"""What one pair may lack while the recording is sound."""
 
 
 @dataclass(frozen=True)
@@ -150,9 +152,13 @@ def _measure_pair(
         return NO_TRUTH
     pairs: dict[MotorSource | None, FramePair] = {}
     try:
-        for motor_source in {method.motor_source for method in methods}:
+        for motor_source in dict.fromkeys(method.motor_source for method in methods):
             pairs[motor_source] = truth.pair(index, motor_source)
     except InvalidInputError as err:
+        return err.code
+    except DatasetError as err:
+        if err.code not in NO_PAIR:
+            raise
         return err.code
     for method in methods:
         pair = pairs[method.motor_source]
