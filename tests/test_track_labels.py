@@ -11,7 +11,7 @@ from moving_boxes import detection, roi
 
 from viflow_anomaly.detection import EvidenceValue, load_detection_schema, to_json
 from viflow_anomaly.detection_reading import detection_from_json
-from viflow_anomaly.track_labels import static_flow_px, untracked, with_tracks
+from viflow_anomaly.track_labels import TrackLabel, static_flow_px, untracked, with_tracks
 
 FOUND = detection(
     0,
@@ -23,15 +23,19 @@ FOUND = detection(
     ],
 )
 
+SEVEN = TrackLabel(7, (12.345678, -0.001))
+
 
 def test_numbers_go_to_their_rois_and_nothing_else_changes() -> None:
-    tracked = with_tracks(FOUND, {2: 7}, require_persistence=False)
+    tracked = with_tracks(FOUND, {2: SEVEN}, require_persistence=False)
     assert [one.track_id for one in tracked.rois] == [None, 7, None, None]
-    assert replace(tracked, rois=tuple(replace(one, track_id=None) for one in tracked.rois)) == FOUND
+    told = {"own_velocity_u_px_s": 12.35, "own_velocity_v_px_s": 0.0}
+    assert tracked.rois[1] == replace(FOUND.rois[1], track_id=7, evidence=FOUND.rois[1].evidence | told)
+    assert [*tracked.rois[:1], *tracked.rois[2:]] == [*FOUND.rois[:1], *FOUND.rois[2:]]
 
 
 def test_unsupported_motion_becomes_model_error_below_the_supported_and_nothing_is_lost() -> None:
-    tracked = with_tracks(FOUND, {2: 7}, require_persistence=True)
+    tracked = with_tracks(FOUND, {2: SEVEN}, require_persistence=True)
     found = [(one.id, one.track_id, one.label, one.score, one.bbox.x) for one in tracked.rois]
     assert found == [
         (1, 7, "independent_motion", 0.8, 200),
@@ -45,7 +49,7 @@ def test_unsupported_motion_becomes_model_error_below_the_supported_and_nothing_
 
 @pytest.mark.parametrize("persistence", [False, True])
 def test_what_was_written_can_be_taken_out_again(persistence: bool) -> None:
-    tracked = with_tracks(FOUND, {2: 7, 4: 3}, require_persistence=persistence)
+    tracked = with_tracks(FOUND, {2: SEVEN, 4: TrackLabel(3, (0.0, 0.0))}, require_persistence=persistence)
     assert untracked(tracked) == FOUND
     assert untracked(detection_from_json(to_json(tracked))) == untracked(detection_from_json(to_json(FOUND)))
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from moving_boxes import detection, roi
 
 from viflow_anomaly.config import TrackingConfig
-from viflow_anomaly.detection import Detection, ImageSize, Roi
+from viflow_anomaly.detection import OWN_VELOCITY_NAMES, Detection, ImageSize, Roi
 from viflow_anomaly.errors import InvalidInputError
 from viflow_anomaly.tracking import Tracker, TrackingState
 
@@ -44,6 +44,8 @@ def test_a_box_at_constant_velocity_over_a_panning_camera_keeps_its_number() -> 
     (track,) = state.tracks
     assert track.box.own_velocity_px_s == pytest.approx((120.0, 0.0), abs=5.0)
     assert track.static_px_s == (-500.0, 0.0)
+    told = [tracked[-1].rois[0].evidence[name] for name in OWN_VELOCITY_NAMES]
+    assert told == pytest.approx(track.box.own_velocity_px_s, abs=0.005)
     assert (track.sightings, track.last_seen_ns) == (20, tracked[-1].source_timestamp_ns)
 
 

@@ -27,6 +27,8 @@ EVIDENCE_DECIMALS = 4
 MILLISECOND_DECIMALS = 3
 STATIC_FLOW_NAMES = ("static_flow_u_px", "static_flow_v_px")
 """In a ROI's evidence: where the static world at its middle goes until the target frame, in source pixels."""
+OWN_VELOCITY_NAMES = ("own_velocity_u_px_s", "own_velocity_v_px_s")
+"""In a tracked ROI's evidence: what its track moves beyond the static world, in source pixels a second."""
 
 JsonObject = dict[str, Any]
 EvidenceValue = float | int | str | bool | None

@@ -23,7 +23,7 @@ from viflow_anomaly.config import TrackingConfig
 from viflow_anomaly.detection import Detection, ImageSize, Roi
 from viflow_anomaly.errors import InvalidInputError
 from viflow_anomaly.track_filter import BoxNoise, BoxState, measure
-from viflow_anomaly.track_labels import static_flow_px, untracked, with_tracks
+from viflow_anomaly.track_labels import TrackLabel, static_flow_px, untracked, with_tracks
 
 Vector = tuple[float, float]
 CONFIRMING_SIGHTINGS = 2
@@ -108,8 +108,12 @@ class Tracker:
         links, next_id = self._numbered(links, state.next_id)
         flow = _StaticFlow.of(detection)
         after = replace(_at(detection, [flow.carry(link) for link in links]), next_id=next_id)
-        numbers = {roi.id: track.track_id for track, roi in links if roi and track.track_id}
-        return after, with_tracks(detection, numbers, require_persistence=self.config.require_persistence)
+        labels = {
+            roi.id: TrackLabel(track.track_id, track.box.own_velocity_px_s)
+            for track, roi in links
+            if roi is not None and track.track_id is not None
+        }
+        return after, with_tracks(detection, labels, require_persistence=self.config.require_persistence)
 
     def _carried(self, state: TrackingState, detection: Detection, noise: BoxNoise) -> list[Track]:
         """The tracks at the detection's source frame; none behind a gap or a change of the image's size."""
