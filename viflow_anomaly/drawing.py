@@ -155,12 +155,12 @@ def _draw_arrow(panel: Picture, roi: Roi, scale: _Scale) -> None:
     velocity = [roi.evidence.get(name) for name in OWN_VELOCITY_NAMES]
     if roi.label == "model_error" or not all(isinstance(value, (int, float)) for value in velocity):
         return
-    way = [float(value or 0.0) * ARROW_S * factor for value, factor in zip(velocity, scale, strict=True)]
-    if np.hypot(*way) < MIN_ARROW_PX:
-        return
-    start = [(middle + 0.5) * factor - 0.5 for middle, factor in zip(roi.bbox.middle_px, scale, strict=True)]
-    end = [round(begin + step) for begin, step in zip(start, way, strict=True)]
-    cv2.arrowedLine(panel, (round(start[0]), round(start[1])), (end[0], end[1]), YELLOW, 2, tipLength=0.3)
+    u, v = roi.bbox.middle_px
+    x, y = (u + 0.5) * scale.x, (v + 0.5) * scale.y
+    right, down = (float(value or 0.0) * ARROW_S * factor for value, factor in zip(velocity, scale, strict=True))
+    if float(np.hypot(right, down)) >= MIN_ARROW_PX:
+        tip = round(x + right), round(y + down)
+        cv2.arrowedLine(panel, (round(x), round(y)), tip, YELLOW, 2, tipLength=0.3)
 
 
 def _draw_dashed_box(panel: Picture, left_top: tuple[int, int], right_bottom: tuple[int, int]) -> None:
