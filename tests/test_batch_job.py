@@ -25,6 +25,7 @@ from viflow_anomaly.errors import DatasetError, InvalidInputError, ViflowError
 from viflow_anomaly.sensor_data import FramePair
 
 FRAMES = 6
+STUMP = b'{"schema_version":"1.0","source_timestamp_ns":1,"target_timestamp_ns":2,"status":"ok"}\n'
 
 
 class StoppedError(Exception):
@@ -247,7 +248,9 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
     assert names[0] == names[1] == ["detections.jsonl", "overlay.mp4", "overlays", "run.json"]
 
 
-@pytest.mark.parametrize("tail", [b'{"source_timestamp_ns":12', b'{"broken":1}\n', b"\0\0\0\n", b"[]\n", b"not json\n"])
+@pytest.mark.parametrize(
+    "tail", [b'{"source_timestamp_ns":12', b'{"broken":1}\n', b"\0\0\0\n", b"[]\n", b"not json\n", STUMP]
+)
 def test_a_damaged_end_of_the_journal_is_dropped(
     recording: FileRecording, tmp_path: Path, out: Path, tail: bytes
 ) -> None:

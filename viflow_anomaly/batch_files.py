@@ -22,6 +22,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from viflow_anomaly.detection_reading import detection_from_json
 from viflow_anomaly.errors import InvalidInputError
 
 DETECTIONS_NAME = "detections.jsonl"
@@ -140,10 +141,10 @@ def _parse_line(raw: bytes) -> tuple[Stamps, str] | None:
     if not raw.endswith(b"\n"):
         return None
     try:
-        entry = json.loads(raw)
-        return (int(entry["source_timestamp_ns"]), int(entry["target_timestamp_ns"])), str(entry["status"])
-    except (ValueError, KeyError, TypeError):
+        detection = detection_from_json(raw)
+    except InvalidInputError:
         return None
+    return (detection.source_timestamp_ns, detection.target_timestamp_ns), detection.status
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
