@@ -403,6 +403,23 @@ def test_tracks_of_a_resumed_run_equal_an_uninterrupted_ones(
     assert (out / "detections.jsonl").read_bytes() == before
 
 
+def test_tracks_of_pairs_that_failed_at_first_are_those_of_a_whole_run(
+    square: FileRecording, tmp_path: Path, out: Path
+) -> None:
+    run_batch(square, DifferenceDetector(), BatchOptions(out_dir=tmp_path / "whole"))
+    image = square.frame_paths[1].read_bytes()
+    square.frame_paths[1].write_bytes(b"")
+    assert run_batch(square, DifferenceDetector(), BatchOptions(out_dir=out)).failed == 2
+    square.frame_paths[1].write_bytes(image)
+    run_batch(square, DifferenceDetector(), BatchOptions(out_dir=out, resume=True))
+    assert detections(out) == detections(tmp_path / "whole")
+
+
+def test_pairs_that_overlap_are_tracked(square: FileRecording, out: Path) -> None:
+    run_batch(square, DifferenceDetector(), BatchOptions(out_dir=out, look_ahead=2))
+    assert [line["rois"][0]["track_id"] for line in detections(out)] == [1] * 4
+
+
 def test_required_persistence_takes_the_first_sighting_back(square: FileRecording, out: Path) -> None:
     tracking = TrackingConfig(require_persistence=True, confirm_score=1.0)
     run_batch(square, DifferenceDetector(), BatchOptions(out_dir=out, tracking=tracking))

@@ -65,3 +65,21 @@ def test_another_schema_version_is_refused() -> None:
     with pytest.raises(InvalidInputError, match=r"expected schema_version 1\.0, found '9\.0'") as caught:
         detection_from_json(text)
     assert caught.value.code == "schema_version_unknown"
+
+
+@pytest.mark.parametrize("later_ns", [0, -1])
+def test_a_target_that_is_not_later_is_refused(later_ns: int) -> None:
+    values = to_json_dict(DETECTION)
+    values["target_timestamp_ns"] = values["source_timestamp_ns"] + later_ns
+    with pytest.raises(InvalidInputError, match="expected a target later than its source") as caught:
+        detection_from_json(json.dumps(values))
+    assert (caught.value.code, caught.value.field) == ("target_not_later", "target_timestamp_ns")
+
+
+@pytest.mark.parametrize("side", ["width", "height"])
+def test_an_empty_box_is_refused(side: str) -> None:
+    values = to_json_dict(DETECTION)
+    values["rois"][0]["bbox"][side] = 0
+    with pytest.raises(InvalidInputError, match="at least a pixel wide and high, found") as caught:
+        detection_from_json(json.dumps(values))
+    assert (caught.value.code, caught.value.field) == ("detection_box_empty", "rois.bbox")

@@ -26,7 +26,8 @@ def detection_from_json(text: str | bytes) -> Detection:
     ``to_json`` of the result is the same text; the JSON Schema says what it may hold, and is not checked here.
 
     Raises:
-        InvalidInputError: ``detection_unreadable``: no JSON object, or a part is missing; ``schema_version_unknown``.
+        InvalidInputError: ``detection_unreadable``: no JSON object, or a part is missing; ``schema_version_unknown``;
+            ``target_not_later``, ``detection_box_empty``: numbers that contradict themselves.
     """
     try:
         values = json.loads(text)
@@ -45,7 +46,27 @@ def detection_from_json(text: str | bytes) -> Detection:
             code="schema_version_unknown",
             field="schema_version",
         )
+    _refuse_contradictions(found)
     return found
+
+
+def _refuse_contradictions(detection: Detection) -> None:
+    """What the schema cannot say, or what arithmetic would stumble over."""
+    source_ns, target_ns = detection.source_timestamp_ns, detection.target_timestamp_ns
+    if target_ns <= source_ns:
+        raise InvalidInputError(
+            f"detection: expected a target later than its source at {source_ns} ns, found {target_ns} ns",
+            code="target_not_later",
+            field="target_timestamp_ns",
+        )
+    for roi in detection.rois:
+        if roi.bbox.width < 1 or roi.bbox.height < 1:
+            raise InvalidInputError(
+                f"detection: expected boxes at least a pixel wide and high, found {roi.bbox.width}x{roi.bbox.height} "
+                f"in the region {roi.id}",
+                code="detection_box_empty",
+                field="rois.bbox",
+            )
 
 
 def _detection(values: JsonObject) -> Detection:
