@@ -18,13 +18,14 @@ from viflow_anomaly import batch_files, batch_record
 from viflow_anomaly.batch_files import Journal
 from viflow_anomaly.batch_job import BatchOptions, run_batch
 from viflow_anomaly.batch_pictures import spread_indices
-from viflow_anomaly.config import DetectorConfig, RegionConfig
+from viflow_anomaly.config import DetectorConfig, RegionConfig, TrackingConfig
 from viflow_anomaly.datasets.recording import FileRecording
 from viflow_anomaly.detection import ModelInfo, load_detection_schema
 from viflow_anomaly.errors import DatasetError, InvalidInputError, ViflowError
 from viflow_anomaly.sensor_data import FramePair
 
 FRAMES = 6
+STUMP = b'{"schema_version":"1.0","source_timestamp_ns":1,"target_timestamp_ns":2,"status":"ok"}\n'
 
 
 class StoppedError(Exception):
@@ -97,7 +98,8 @@ def test_run_json_records_what_decided_the_results(recording: FileRecording, out
     run = run_json(out)
     assert run["state"] == "done"
     assert run["counts"] == {"pairs": 3, "ok": 3, "abstained": 0, "failed": 0}
-    assert run["options"] == {"look_ahead": 2, "limit": 3, "overlays": 0, "video": False}
+    tracking = TrackingConfig().model_dump(mode="json")
+    assert run["options"] == {"look_ahead": 2, "limit": 3, "overlays": 0, "video": False, "tracking": tracking}
     assert run["configuration"] == {"threads": 1, "detector": DetectorConfig().model_dump(mode="json")}
     assert run["model"] == {"name": "difference", "version": "1", "sha256": "ab" * 32}
     assert run["recording"]["frames"] == FRAMES
@@ -246,7 +248,9 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
     assert names[0] == names[1] == ["detections.jsonl", "overlay.mp4", "overlays", "run.json"]
 
 
-@pytest.mark.parametrize("tail", [b'{"source_timestamp_ns":12', b'{"broken":1}\n', b"\0\0\0\n", b"[]\n", b"not json\n"])
+@pytest.mark.parametrize(
+    "tail", [b'{"source_timestamp_ns":12', b'{"broken":1}\n', b"\0\0\0\n", b"[]\n", b"not json\n", STUMP]
+)
 def test_a_damaged_end_of_the_journal_is_dropped(
     recording: FileRecording, tmp_path: Path, out: Path, tail: bytes
 ) -> None:
@@ -306,6 +310,8 @@ def test_resume_adds_pictures_to_finished_detections(recording: FileRecording, o
             "configuration.detector.regions.max_regions",
         ),
         (DifferenceDetector(), {"look_ahead": 2}, "options.look_ahead"),
+        (DifferenceDetector(), {"tracking": None}, "options.tracking"),
+        (DifferenceDetector(), {"tracking": TrackingConfig(max_gap_s=2.0)}, "options.tracking.max_gap_s"),
     ],
 )
 def test_resume_with_other_settings_is_refused(
@@ -347,6 +353,82 @@ def test_resume_with_a_record_that_lacks_everything_is_refused(recording: FileRe
     (out / "run.json").write_text('{"model": 1}')
     with pytest.raises(InvalidInputError, match=r"model\.sha256"):
         run_batch(recording, DifferenceDetector(), BatchOptions(out_dir=out, resume=True))
+
+
+# --- tracks
+
+
+@pytest.fixture
+def square(tmp_path: Path) -> FileRecording:
+    """Nothing but a square moves: one region a pair."""
+    return in_memory(make_world(frames=FRAMES, shift_px=0, square_px=24), tmp_path / "square")
+
+
+def test_a_mover_keeps_its_number(square: FileRecording, out: Path) -> None:
+    tracking = TrackingConfig(confirm_score=1.0)
+    run_batch(square, DifferenceDetector(), BatchOptions(out_dir=out, tracking=tracking))
+    numbers = [[roi["track_id"] for roi in line["rois"]] for line in detections(out)]
+    assert numbers == [[None], [1], [1], [1], [1]]
+
+
+def test_without_tracking_nothing_is_numbered(recording: FileRecording, tmp_path: Path, out: Path) -> None:
+    run_batch(recording, DifferenceDetector(), BatchOptions(out_dir=tmp_path / "tracked"))
+    run_batch(recording, DifferenceDetector(), BatchOptions(out_dir=out, tracking=None, overlays=1))
+    plain, tracked = detections(out), detections(tmp_path / "tracked")
+    assert plain != tracked
+    for line in tracked:
+        for roi in line["rois"]:
+            roi["track_id"] = None
+            roi["evidence"] = {name: value for name, value in roi["evidence"].items() if "own_velocity" not in name}
+    assert plain == tracked
+
+
+@pytest.mark.parametrize("persistence", [False, True])
+@pytest.mark.parametrize("at", [1, 3])
+def test_tracks_of_a_resumed_run_equal_an_uninterrupted_ones(
+    recording: FileRecording, tmp_path: Path, out: Path, at: int, persistence: bool
+) -> None:
+    tracking = TrackingConfig(require_persistence=persistence, confirm_score=1.0)
+    options = BatchOptions(out_dir=tmp_path / "whole", overlays="all", tracking=tracking)
+    run_batch(recording, DifferenceDetector(), options)
+    stop_run(recording, options.model_copy(update={"out_dir": out}), at=at)
+    again = options.model_copy(update={"out_dir": out, "resume": True})
+    run_batch(recording, DifferenceDetector(), again)
+    assert detections(out) == detections(tmp_path / "whole")
+    assert any(roi["track_id"] for line in detections(out) for roi in line["rois"])
+    for whole in (tmp_path / "whole" / "overlays").iterdir():
+        assert (out / "overlays" / whole.name).read_bytes() == whole.read_bytes()
+    before = (out / "detections.jsonl").read_bytes()
+    run_batch(recording, DifferenceDetector(), again)  # a run that ended is tracked anew from its own lines
+    assert (out / "detections.jsonl").read_bytes() == before
+
+
+def test_tracks_of_pairs_that_failed_at_first_are_those_of_a_whole_run(
+    square: FileRecording, tmp_path: Path, out: Path
+) -> None:
+    run_batch(square, DifferenceDetector(), BatchOptions(out_dir=tmp_path / "whole"))
+    image = square.frame_paths[1].read_bytes()
+    square.frame_paths[1].write_bytes(b"")
+    assert run_batch(square, DifferenceDetector(), BatchOptions(out_dir=out)).failed == 2
+    square.frame_paths[1].write_bytes(image)
+    run_batch(square, DifferenceDetector(), BatchOptions(out_dir=out, resume=True))
+    assert detections(out) == detections(tmp_path / "whole")
+
+
+def test_pairs_that_overlap_are_tracked(square: FileRecording, out: Path) -> None:
+    run_batch(square, DifferenceDetector(), BatchOptions(out_dir=out, look_ahead=2))
+    assert [line["rois"][0]["track_id"] for line in detections(out)] == [1] * 4
+
+
+def test_required_persistence_takes_the_first_sighting_back(square: FileRecording, out: Path) -> None:
+    tracking = TrackingConfig(require_persistence=True, confirm_score=1.0)
+    run_batch(square, DifferenceDetector(), BatchOptions(out_dir=out, tracking=tracking))
+    first, *later = [line["rois"][0] for line in detections(out)]
+    assert (first["label"], first["track_id"]) == ("model_error", None)
+    assert first["score"] == pytest.approx(first["evidence"]["two_frame_score"] - 0.5)
+    assert [(roi["label"], roi["track_id"]) for roi in later] == [("independent_motion", 1)] * 4
+    for line in (out / "detections.jsonl").read_text().splitlines():
+        jsonschema.validate(json.loads(line), load_detection_schema())
 
 
 # --- what goes wrong on the way

@@ -16,6 +16,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 
 from viflow_anomaly.config import RegionConfig
 from viflow_anomaly.detection import (
+    STATIC_FLOW_NAMES,
     AnalyzedRegion,
     Detection,
     ImageSize,
@@ -216,6 +217,18 @@ class TestRoisFromRegions:
         assert all(roi.mask_rle is None and roi.track_id is None for roi in rois)
         assert rois[0].area_px == 1200
         assert rois[0].evidence["rule"] == "extended_in_x_and_y"
+
+    def test_static_flow_is_told_at_the_middle_of_each_box(self) -> None:
+        coordinates = np.zeros((80, 120, 2), np.float32)
+        coordinates[24, 39] = (42.126, 23.5)  # the middle of the first region; the rest of the map is another story
+        coordinates[59, 17] = (np.nan, np.inf)
+        first, second = rois_from_regions(
+            self.regions(), ImageSize(200, 100), offset=(7, 9), target_coordinates=coordinates
+        )
+        assert [first.evidence[name] for name in STATIC_FLOW_NAMES] == [3.13, -0.5]
+        assert [second.evidence[name] for name in STATIC_FLOW_NAMES] == [None, None]
+        untold, _ = rois_from_regions(self.regions(), ImageSize(200, 100))
+        assert not set(STATIC_FLOW_NAMES) & untold.evidence.keys()
 
     def test_masks_cover_the_whole_image(self) -> None:
         first, _ = rois_from_regions(self.regions(), ImageSize(200, 100), include_masks=True, offset=(7, 9))

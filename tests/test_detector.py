@@ -139,6 +139,23 @@ def test_a_patch_that_moves_on_its_own_is_found_where_it_is(
     assert 120 <= bottom <= 170
 
 
+def test_the_evidence_says_where_the_static_world_goes(detector: AnomalyDetector) -> None:
+    rate = (0.3, 0.8, -0.5)
+    source, target = with_moved_patch(texture(3), turned(texture(3), rate))
+    analysis = detector.analyze(pair(source, target, rate=rate))
+    (roi, *_) = analysis.detection.rois
+    u, v = (int(middle) for middle in roi.bbox.middle_px)
+    told = [roi.evidence["static_flow_u_px"], roi.evidence["static_flow_v_px"]]
+    assert told == pytest.approx(analysis.flow_px[v, u].tolist(), abs=0.005)
+    ray = so3_exp(np.array(rate) * INTERVAL_NS * 1e-9).T @ (
+        (u - (WIDTH - 1) / 2) / FOCAL_PX,
+        (v - (HEIGHT - 1) / 2) / FOCAL_PX,
+        1.0,
+    )
+    landed = FOCAL_PX * ray[:2] / ray[2] + ((WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+    assert told == pytest.approx((landed - (u, v)).tolist(), abs=0.3)
+
+
 def test_the_same_input_gives_the_same_bytes(detector: AnomalyDetector) -> None:
     source, target = with_moved_patch(texture(4), texture(4))
     first, second = (replace(detector.detect(pair(source, target)), timings_ms={}) for _ in range(2))

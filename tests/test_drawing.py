@@ -11,6 +11,7 @@ import pytest
 
 from viflow_anomaly import drawing
 from viflow_anomaly.detection import (
+    OWN_VELOCITY_NAMES,
     AnalyzedRegion,
     Detection,
     ImageSize,
@@ -110,6 +111,25 @@ def test_a_track_is_named() -> None:
     plain = draw(make_detection(752, 480, roi))
     tracked = draw(make_detection(752, 480, replace(roi, track_id=12)))
     assert (plain != tracked).any()
+
+
+def tracked_roi(*velocity_px_s: float, label: RegionLabel = "independent_motion") -> Roi:
+    roi = make_roi(300, 200, 41, 41, label=label)
+    return replace(roi, track_id=12, evidence=dict(zip(OWN_VELOCITY_NAMES, velocity_px_s, strict=True)))
+
+
+def test_an_arrow_shows_where_a_tracked_thing_goes_by_itself() -> None:
+    panel = draw(make_detection(752, 480, tracked_roi(400.0, -200.0)))[TITLE_PX : TITLE_PX + 480, :752]
+    ys, xs = np.nonzero((panel == np.array(drawing.YELLOW)).all(axis=-1))
+    assert xs.min() == pytest.approx(320, abs=3)  # the middle of the box
+    assert xs.max() == pytest.approx(420, abs=3)  # a quarter of a second later
+    assert ys[xs == xs.min()].mean() == pytest.approx(220, abs=3)
+    assert ys[xs == xs.max()].mean() == pytest.approx(170, abs=3)
+
+
+@pytest.mark.parametrize("roi", [tracked_roi(4.0, 4.0), tracked_roi(90.0, 0.0, label="model_error")])
+def test_what_hardly_moves_or_is_no_motion_has_no_arrow(roi: Roi) -> None:
+    assert not has_color(draw(make_detection(752, 480, roi)), drawing.YELLOW)
 
 
 def test_the_residual_is_drawn_to_a_fixed_scale() -> None:

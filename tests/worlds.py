@@ -89,7 +89,7 @@ def make_world(
         time_offset_s=time_offset_s,
     )
     panorama = textured_image(width + shift_px * frames, height, seed=seed)
-    images = [np.ascontiguousarray(panorama[:, k * shift_px : k * shift_px + width]) for k in range(frames)]
+    images = [panorama[:, k * shift_px : k * shift_px + width].copy() for k in range(frames)]
     if square_px:
         patch = textured_image(square_px, square_px, seed=seed + 1)
         for k, image in enumerate(images):

@@ -16,12 +16,13 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from viflow_anomaly.detection_reading import detection_from_json
 from viflow_anomaly.errors import InvalidInputError
 
 DETECTIONS_NAME = "detections.jsonl"
@@ -113,14 +114,22 @@ class Journal:
         self._end = 0
         self.lines.clear()
 
-    def publish(self, destination: Path) -> None:
-        """Write all lines in time order to ``destination`` (whole or not at all), and remove the journal."""
+    def text(self, stamps: Stamps) -> bytes:
+        """The line of one pair, with its newline."""
+        line = self.lines[stamps]
+        self._file.seek(line.offset)
+        return self._file.read(line.length)
+
+    def publish(self, destination: Path, finish: Callable[[Iterator[bytes]], Iterable[bytes]] = iter) -> None:
+        """Write all lines to ``destination`` (whole or not at all), and remove the journal.
+
+        Args:
+            destination: of the lines.
+            finish: given all lines in time order, says what is written in their place.
+        """
         temporary = destination.with_name(f".{destination.name}.sorted")
         with temporary.open("wb") as sorted_file:
-            for stamps in sorted(self.lines):
-                line = self.lines[stamps]
-                self._file.seek(line.offset)
-                sorted_file.write(self._file.read(line.length))
+            sorted_file.writelines(finish(self.text(stamps) for stamps in sorted(self.lines)))
             sorted_file.flush()
             os.fsync(sorted_file.fileno())
         temporary.replace(destination)
@@ -132,10 +141,10 @@ def _parse_line(raw: bytes) -> tuple[Stamps, str] | None:
     if not raw.endswith(b"\n"):
         return None
     try:
-        entry = json.loads(raw)
-        return (int(entry["source_timestamp_ns"]), int(entry["target_timestamp_ns"])), str(entry["status"])
-    except (ValueError, KeyError, TypeError):
+        detection = detection_from_json(raw)
+    except InvalidInputError:
         return None
+    return (detection.source_timestamp_ns, detection.target_timestamp_ns), detection.status
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:

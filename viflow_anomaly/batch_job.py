@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -33,18 +34,22 @@ from viflow_anomaly.batch_record import (
     describe_run,
     summarise,
 )
-from viflow_anomaly.config import DetectorConfig, FrozenConfig, MotorSource
+from viflow_anomaly.batch_tracking import tracked_lines
+from viflow_anomaly.config import DetectorConfig, FrozenConfig, MotorSource, TrackingConfig
 from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.datasets.recording import Recording
 from viflow_anomaly.detection import Detection, ModelInfo, to_json
+from viflow_anomaly.detection_reading import detection_from_json
 from viflow_anomaly.errors import DatasetError, InvalidInputError, ViflowError
 from viflow_anomaly.sensor_data import FramePair
+from viflow_anomaly.tracking import Tracker, TrackingState
 
 
 class BatchOptions(FrozenConfig):
     """Where a batch run writes, which pairs it takes and what it draws.
 
-    ``overlays``: how many pictures, spread evenly over the run, or ``"all"``.
+    ``overlays``: how many pictures, spread evenly over the run, or ``"all"``. ``tracking``: how regions become tracks;
+    None: they do not, ``track_id`` stays null.
     """
 
     out_dir: Path
@@ -52,6 +57,7 @@ class BatchOptions(FrozenConfig):
     limit: PositiveInt | None = None
     overlays: NonNegativeInt | Literal["all"] = 0
     video: bool = False
+    tracking: TrackingConfig | None = TrackingConfig()
     resume: bool = False
     overwrite: bool = False
 
@@ -118,13 +124,14 @@ def run_batch(
         reused = len(journal.lines)
         complete = all(pairs.stamps(index) in journal.lines for index in range(count))
         pictures = Pictures(options.out_dir, count, overlays=options.overlays, video=options.video, complete=complete)
-        failures = []
+        tracker = Tracker(options.tracking) if options.tracking else None
+        failures, state = [], TrackingState()
         for index in range(count):
-            failure = _judge(pairs, index, detector, journal, pictures)
+            failure, state = _judge(pairs, index, detector, journal, pictures, tracker, state)
             failures += [failure] if failure else []
             if on_progress:
                 on_progress(index + 1, count, len(failures))
-        journal.publish(options.out_dir / DETECTIONS_NAME)
+        journal.publish(options.out_dir / DETECTIONS_NAME, partial(tracked_lines, tracker=tracker))
         pictures.finish([pairs.stamps(index)[0] for index in range(count)])
         wall_time_s = time.monotonic() - started
         summary = summarise(options.out_dir, journal.lines, failures, reused=reused, wall_time_s=wall_time_s)
@@ -133,30 +140,45 @@ def run_batch(
 
 
 def _judge(
-    pairs: RecordingPairs, index: int, detector: PairDetector, journal: Journal, pictures: Pictures
-) -> PairFailure | None:
-    """Detect, draw and write down one pair, or say why that cannot be done."""
+    pairs: RecordingPairs,
+    index: int,
+    detector: PairDetector,
+    journal: Journal,
+    pictures: Pictures,
+    tracker: Tracker | None,
+    state: TrackingState,
+) -> tuple[PairFailure | None, TrackingState]:
+    """Detect, draw and write down one pair, or say why that cannot be done.
+
+    ``state``, before and after the pair, is what pictures show; the journal is tracked as a whole when the run ends.
+    """
     stamps = pairs.stamps(index)
     draw = pictures.missing(index, stamps[0])
     known = stamps in journal.lines
     if known and not draw:
-        return None
+        return None, _followed(tracker, state, journal.text(stamps))[0] if pictures.any else state
     try:
         started = time.perf_counter()
         pair = pairs[index]
         decode_ms = (time.perf_counter() - started) * 1e3
-        if draw:
-            analysis = detector.analyze(pair, decode_ms=decode_ms)
-            detection, picture = analysis.detection, overlay_of(pair, analysis)
-        else:
-            detection, picture = detector.detect(pair, decode_ms=decode_ms), None
+        analysis = detector.analyze(pair, decode_ms=decode_ms) if draw else None
+        detection = analysis.detection if analysis else detector.detect(pair, decode_ms=decode_ms)
     except ViflowError as err:
-        return PairFailure(*stamps, err.code, err.field, err.message)
-    if picture is not None:
-        pictures.write(index, stamps[0], picture)
+        return PairFailure(*stamps, err.code, err.field, err.message), state
+    text = to_json(detection)
+    if pictures.any:
+        state, tracked = _followed(tracker, state, journal.text(stamps) if known else text)
+        if analysis is not None:
+            pictures.write(index, stamps[0], overlay_of(pair, analysis, tracked))
     if not known:
-        journal.append(stamps, detection.status, to_json(detection))
-    return None
+        journal.append(stamps, detection.status, text)
+    return None, state
+
+
+def _followed(tracker: Tracker | None, state: TrackingState, text: str | bytes) -> tuple[TrackingState, Detection]:
+    """One step of tracking, from what is written down: its numbers are rounded."""
+    detection = detection_from_json(text)
+    return (state, detection) if tracker is None else tracker.update(state, detection)
 
 
 def _prepare(options: BatchOptions, run: Mapping[str, Any]) -> None:

@@ -49,6 +49,11 @@ class Pictures:
         self._wanted = spread_indices(count, count if overlays == "all" else overlays)
         self._video = video and not (complete and self._video_path.exists())
 
+    @property
+    def any(self) -> bool:
+        """Whether any picture is asked for."""
+        return self._video or bool(self._wanted)
+
     def missing(self, index: int, source_ns: int) -> bool:
         """Whether the picture of pair ``index`` is asked for and not there yet."""
         path = self._path(index, source_ns)
@@ -100,9 +105,9 @@ def spread_indices(count: int, wanted: int) -> frozenset[int]:
     return frozenset(round(index) for index in np.linspace(0, count - 1, wanted).tolist())
 
 
-def overlay_of(pair: FramePair, analysis: PairAnalysis) -> Uint8Array:
-    """The picture of one pair, [H, W, 3] BGR."""
-    return draw_overlay(pair.source.image, analysis.detection, residual=analysis.residual)
+def overlay_of(pair: FramePair, analysis: PairAnalysis, tracked: Detection | None = None) -> Uint8Array:
+    """The picture of one pair, [H, W, 3] BGR; with the boxes of ``tracked`` where its tracks are known."""
+    return draw_overlay(pair.source.image, tracked or analysis.detection, residual=analysis.residual)
 
 
 def write_png(path: Path, picture: Uint8Array) -> None:

@@ -22,6 +22,7 @@ _DECISIVE = (
     "model.sha256",
     "configuration.detector",
     "options.look_ahead",
+    "options.tracking",
     "recording.camera",
     "versions.viflow-anomaly",
 )

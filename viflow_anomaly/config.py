@@ -260,6 +260,31 @@ class DetectorConfig(FrozenConfig):
     max_exposure_jump_gray: float = Field(default=40.0, ge=0, description="change of the mean between the frames")
 
 
+class TrackingConfig(FrozenConfig):
+    """How regions of successive pairs become tracks; see ``tracking``. Times are seconds, so that a setting survives a
+    change of the frame rate; fractions are of the image diagonal.
+    """
+
+    feed_score: float = Field(default=0.25, ge=0, le=1, description="a region feeds a confirmed track from here on")
+    confirm_score: float = Field(default=0.75, ge=0, le=1, description="a region opens a confirmed track from here on")
+    max_missed_s: float = Field(default=0.3, ge=0, le=60, description="a confirmed track ends when missed for longer")
+    max_gap_s: float = Field(default=0.6, gt=0, le=60, description="no track is carried over a longer gap")
+    max_tracks: int = Field(default=64, ge=1, le=4096)
+    gate_sigmas: float = Field(default=4.0, gt=0, le=100, description="a region further from its track is another one")
+    center_sigma: float = Field(default=0.15, gt=0, le=10, description="of a region's centre, in sides of its box")
+    log_side_sigma: float = Field(default=0.3, gt=0, le=10, description="of the logarithm of a region's sides")
+    own_speed_fraction_s: float = Field(default=0.15, gt=0, le=100, description="sigma of a new track's own speed")
+    acceleration_fraction_s: float = Field(
+        default=0.3, gt=0, le=1000, description="sigma of the own speed's change within a second"
+    )
+    growth_s: float = Field(
+        default=0.3, gt=0, le=100, description="sigma of the growth of the sides' logarithm a second"
+    )
+    require_persistence: bool = Field(
+        default=False, description="independent motion that no confirmed track supports becomes model_error"
+    )
+
+
 def loss_of_preset(preset: str) -> str:
     """The loss that ``TrainingConfig.loss`` "auto" stands for."""
     return {"paper": "squared", "compact": "charbonnier", "calibrated": "corrected"}[preset]

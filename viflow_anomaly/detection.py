@@ -7,7 +7,7 @@ The same detection gives the same bytes apart from ``timings_ms``: keys have a f
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Any, Literal
@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.regions import BoundingBox, Region, RegionLabel
 
 SCHEMA_VERSION = "1.0"
@@ -24,6 +25,10 @@ GRAY_DECIMALS = 3
 PIXEL_DECIMALS = 2
 EVIDENCE_DECIMALS = 4
 MILLISECOND_DECIMALS = 3
+STATIC_FLOW_NAMES = ("static_flow_u_px", "static_flow_v_px")
+"""In a ROI's evidence: where the static world at its middle goes until the target frame, in source pixels."""
+OWN_VELOCITY_NAMES = ("own_velocity_u_px_s", "own_velocity_v_px_s")
+"""In a tracked ROI's evidence: what its track moves beyond the static world, in source pixels a second."""
 
 JsonObject = dict[str, Any]
 EvidenceValue = float | int | str | bool | None
@@ -135,13 +140,48 @@ class Detection:
 
 
 def rois_from_regions(
-    regions: Iterable[Region], image: ImageSize, *, include_masks: bool = False, offset: tuple[int, int] = (0, 0)
+    regions: Sequence[Region],
+    image: ImageSize,
+    *,
+    include_masks: bool = False,
+    offset: tuple[int, int] = (0, 0),
+    target_coordinates: Float32Array | None = None,
 ) -> tuple[Roi, ...]:
-    """Number the regions from 1 in their order; ``offset`` (x, y) is where the residual map begins in the image."""
-    return tuple(_roi(number, region, image, include_masks, offset) for number, region in enumerate(regions, start=1))
+    """Number the regions from 1 in their order.
+
+    Args:
+        regions: of one residual map.
+        image: what they lie in.
+        include_masks: write each region's mask.
+        offset: (x, y) where the residual map begins in the image.
+        target_coordinates: [H, W, 2] (u, v) where the static world at each pixel of the map is in the target image; the
+            ROIs' evidence then says the static flow at their middle.
+    """
+    static = [{} if target_coordinates is None else _static_flow(region, target_coordinates) for region in regions]
+    return tuple(
+        _roi(number, region, image, include_masks, offset, flow)
+        for number, (region, flow) in enumerate(zip(regions, static, strict=True), start=1)
+    )
 
 
-def _roi(number: int, region: Region, image: ImageSize, include_mask: bool, offset: tuple[int, int]) -> Roi:
+def _static_flow(region: Region, target_coordinates: Float32Array) -> dict[str, EvidenceValue]:
+    """At the pixel in the middle of the box; rounded here, so that tracking a value and its JSON is the same."""
+    u, v = (int(middle) for middle in region.bbox.middle_px)
+    target = target_coordinates[v, u].tolist()
+    return {
+        name: round(there - here, PIXEL_DECIMALS) + 0.0 if np.isfinite(there) else None
+        for name, there, here in zip(STATIC_FLOW_NAMES, target, (u, v), strict=True)
+    }
+
+
+def _roi(
+    number: int,
+    region: Region,
+    image: ImageSize,
+    include_mask: bool,
+    offset: tuple[int, int],
+    static_flow: dict[str, EvidenceValue],
+) -> Roi:
     x, y = region.bbox.x + offset[0], region.bbox.y + offset[1]
     return Roi(
         id=number,
@@ -154,7 +194,7 @@ def _roi(number: int, region: Region, image: ImageSize, include_mask: bool, offs
         thickness_px=region.thickness_px,
         residual_mean=region.residual_mean,
         residual_max=region.residual_max,
-        evidence=dict(region.evidence),
+        evidence={**region.evidence, **static_flow},
         mask_rle=encode_mask_rle(region.mask, image=image, offset=(x, y)) if include_mask else None,
     )
 

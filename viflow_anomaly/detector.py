@@ -162,7 +162,9 @@ class AnomalyDetector:
         if not abstained:
             image = ImageSize(width=residual.shape[1], height=residual.shape[0])
             regions = find_regions(evidence, inside, self.config.regions, residual=residual).regions
-            rois = rois_from_regions(regions, image, include_masks=self.config.include_masks)
+            rois = rois_from_regions(
+                regions, image, include_masks=self.config.include_masks, target_coordinates=coordinates
+            )
         finished = time.perf_counter()
         timings_ms = {
             "decode": decode_ms,

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from viflow_anomaly.detection import Detection, Roi
+from viflow_anomaly.detection import OWN_VELOCITY_NAMES, Detection, Roi
 from viflow_anomaly.errors import InvalidInputError, MissingDependencyError
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.sensor_data import Uint8Array
@@ -42,6 +42,9 @@ FONT_SCALE = 0.5
 LINE_HEIGHT_PX = 22
 MARGIN_PX = 8
 DASH_PX = 6
+ARROW_S = 0.25
+"""The arrow of a tracked thing shows its own way in this time."""
+MIN_ARROW_PX = 3.0
 CAPTION_LINES = 3
 """Always as many, so that all pictures of a recording have one size."""
 
@@ -102,7 +105,7 @@ def _source_panel(source: Uint8Array, detection: Detection, size: tuple[int, int
     analyzed = np.zeros(panel.shape[:2], dtype=np.bool_)
     analyzed[top : bottom + 1, left : right + 1] = True
     panel[~analyzed] //= 3
-    for draw in (_draw_box, _draw_label):
+    for draw in (_draw_box, _draw_arrow, _draw_label):
         for roi in sorted(detection.rois, key=lambda roi: (roi.label == "independent_motion", roi.score)):
             draw(panel, roi, scale)
     if detection.status == "abstained":
@@ -145,6 +148,19 @@ def _draw_label(panel: Picture, roi: Roi, scale: _Scale) -> None:
     y = top - 2 if top > LINE_HEIGHT_PX else bottom + LINE_HEIGHT_PX
     track = "" if roi.track_id is None else f"#{roi.track_id} "
     _draw_tag(panel, f"{track}motion {roi.score:.2f}", (left - 1, y), fill=VERMILLION, ink=WHITE)
+
+
+def _draw_arrow(panel: Picture, roi: Roi, scale: _Scale) -> None:
+    """Where a tracked thing would be in ``ARROW_S`` over a world that rests, from the middle of its box."""
+    velocity = [roi.evidence.get(name) for name in OWN_VELOCITY_NAMES]
+    if roi.label == "model_error" or not all(isinstance(value, (int, float)) for value in velocity):
+        return
+    u, v = roi.bbox.middle_px
+    x, y = (u + 0.5) * scale.x, (v + 0.5) * scale.y
+    right, down = (float(value or 0.0) * ARROW_S * factor for value, factor in zip(velocity, scale, strict=True))
+    if float(np.hypot(right, down)) >= MIN_ARROW_PX:
+        tip = round(x + right), round(y + down)
+        cv2.arrowedLine(panel, (round(x), round(y)), tip, YELLOW, 2, tipLength=0.3)
 
 
 def _draw_dashed_box(panel: Picture, left_top: tuple[int, int], right_bottom: tuple[int, int]) -> None:

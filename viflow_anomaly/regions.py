@@ -39,6 +39,11 @@ class BoundingBox(NamedTuple):
     width: int
     height: int
 
+    @property
+    def middle_px(self) -> tuple[float, float]:
+        """(u, v); pixel centres lie at integers."""
+        return self.x + (self.width - 1) / 2, self.y + (self.height - 1) / 2
+
 
 @dataclass(frozen=True, eq=False)
 class Region:

@@ -25,6 +25,7 @@ from viflow_anomaly.config import (
     ImageLimits,
     ModelConfig,
     RuntimeName,
+    TrackingConfig,
     TrainingConfig,
     UsablePath,
 )
@@ -67,6 +68,7 @@ class Settings(FrozenConfig):
     runtime: RuntimeName = "auto"
     limits: ImageLimits = ImageLimits()
     detector: DetectorConfig = DetectorConfig()
+    tracking: TrackingConfig = TrackingConfig()
     model: ModelConfig = ModelConfig()
     training: TrainingConfig = TrainingConfig()
     simulator: SimulatorConfig = Field(default_factory=lambda: SimulatorConfig.model_validate({}))

@@ -62,13 +62,28 @@ def test_options_reach_the_run(ask: Ask, pair: PairFolder, tmp_path: Path) -> No
     out = tmp_path / "out"
     which = ["--format", "plain", "--look-ahead", "2", "--limit", "1"]
     how = ["--overlays", "all", "--video", "--masks", "--set", "detector.regions.max_regions=5"]
+    how += ["--set", "tracking.max_tracks=9"]
     answer = ask(["batch", str(pair.folder), "--out", str(out), *which, *how])
     assert answer.code == 0
     run = json.loads((out / "run.json").read_text())
+    tracking = run["options"].pop("tracking")
     assert run["options"] == {"look_ahead": 2, "limit": 1, "overlays": "all", "video": True}
+    assert (tracking["max_tracks"], tracking["max_gap_s"]) == (9, 0.6)
     assert run["configuration"]["detector"]["regions"]["max_regions"] == 5
     assert run["configuration"]["detector"]["include_masks"] is True
     assert sorted(path.name for path in out.iterdir()) == ["detections.jsonl", "overlay.mp4", "overlays", "run.json"]
+
+
+def test_tracking_can_be_turned_off(ask: Ask, pair: PairFolder, tmp_path: Path) -> None:
+    for name, how in (("on", []), ("off", ["--no-track"])):
+        assert ask(["batch", str(pair.folder), "--out", str(tmp_path / name), *how]).code == 0
+    numbered = {
+        name: {roi["track_id"] for line in lines(tmp_path / name) for roi in json.loads(line)["rois"]}
+        for name in ("on", "off")
+    }
+    assert numbered["off"] == {None}
+    assert 1 in numbered["on"]
+    assert json.loads((tmp_path / "off" / "run.json").read_text())["options"]["tracking"] is None
 
 
 def test_layers_of_settings_are_recorded_as_they_resolved(

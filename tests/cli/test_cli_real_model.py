@@ -14,7 +14,9 @@ import jsonschema
 import pytest
 from pair_world import PairFolder, answer_to
 
-from viflow_anomaly.detection import load_detection_schema
+from viflow_anomaly.detection import load_detection_schema, to_json
+from viflow_anomaly.detection_reading import detection_from_json
+from viflow_anomaly.track_labels import untracked
 
 
 def untimed(text: str) -> dict[str, Any]:
@@ -31,7 +33,7 @@ def test_detect_and_batch_give_the_same_answer(
     out = tmp_path / "out"
     assert answer_to(["batch", str(pair.folder), "--out", str(out), "--overlays", "1"], capsys).code == 0
     lines = (out / "detections.jsonl").read_text().splitlines()
-    assert untimed(lines[0]) == untimed(detected.out)
+    assert untimed(to_json(untracked(detection_from_json(lines[0])))) == untimed(detected.out)
     for line in lines:
         jsonschema.validate(json.loads(line), load_detection_schema())
     run = json.loads((out / "run.json").read_text())

@@ -56,6 +56,7 @@ def batch(
     overlays: Annotated[
         str, typer.Option(metavar="N|all", callback=_how_many, help="Pictures to draw, spread over the run.")
     ] = "0",
+    track: Annotated[bool, typer.Option("--track/--no-track", help="Number what moves, from pair to pair.")] = True,
     video: Annotated[bool, typer.Option("--video", help="Also write overlay.mp4.")] = False,
     masks: Annotated[bool | None, typer.Option("--masks", help="Add each region's mask (COCO RLE).")] = None,
     as_json: AsJson = False,
@@ -91,6 +92,7 @@ def batch(
         limit=limit,
         overlays="all" if overlays == "all" else int(overlays),
         video=video,
+        tracking=settings.tracking if track else None,
         resume=resume,
         overwrite=overwrite,
     )
