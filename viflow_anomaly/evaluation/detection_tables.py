@@ -99,7 +99,7 @@ def notes(report: Report) -> list[str]:
         )
 
     lines = [
-        f"A region finds a mover when their boxes overlap by IoU {rules['min_iou']:g}. One that lies half in an ignored "
+        f"A region finds a mover when their boxes overlap by IoU {rules['min_iou']:g}. One half in an ignored "
         f"box counts neither way. Ignored: movers of less than {rules['min_area_px']} px or of less than "
         f"{rules['min_independent_flow_px']:g} px of motion, and boxes that are not said to move or to rest.",
         f"recall, precision, alarms and IoU: of regions labelled as motion (score >= {rules['motion_score']:g}); "
