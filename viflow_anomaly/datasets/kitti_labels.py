@@ -87,13 +87,14 @@ def label_scale(drive: Path, width: int, height: int) -> tuple[float, float]:
     """Stored pixels for a pixel of the labels, in u and in v: images may be stored smaller than they were labelled.
 
     Args:
-        drive: its folder; the calibration beside it says the full size.
+        drive: its folder; the calibration beside it says the full size, without it 1242x375 is taken.
         width, height: of the images as they are stored.
 
     Raises:
         DatasetError: as ``read_calibration``.
     """
-    values = read_calibration(drive.resolve().parent / "calib_cam_to_cam.txt", {"S_rect_02": 2})
+    path = drive.resolve().parent / "calib_cam_to_cam.txt"
+    values = read_calibration(path, {"S_rect_02": 2}) if path.is_file() else {}
     full_width, full_height = values.get("S_rect_02", OFFICIAL_SIZE)
     return width / float(full_width), height / float(full_height)
 

@@ -127,12 +127,12 @@ def measure_detection(
     scores: dict[SequenceKey, ByMethod] = {}
     skipped: Counter[str] = Counter()
     for done, (pairs, index) in enumerate(chosen, start=1):
-        by_method = scores.setdefault(SequenceKey(pairs.group, pairs.sequence), {})
         try:
             judgements = _judge(methods, pairs, index)
         except InvalidInputError as err:
             skipped[err.code] += 1
         else:
+            by_method = scores.setdefault(SequenceKey(pairs.group, pairs.sequence), {})
             labels = pairs.labels(index)
             for name, (judgement, seconds) in judgements.items():
                 by_method.setdefault(name, MethodScores()).add(judgement, labels, seconds)

@@ -67,7 +67,7 @@ def _class_table(scope: str, figures: dict[str, Any]) -> Table:
         for name in first[kind]
         if any(one[kind][name]["movers"] for one in figures.values())
     ]
-    heads = [f"{name} ({first[kind][name]['movers']})" for kind, name in columns]
+    heads = [f"{kind.removeprefix('by_')} {name} ({first[kind][name]['movers']})" for kind, name in columns]
     rows = tuple(
         (method, *(number_text(one[kind][name]["roi_ap"], 3) for kind, name in columns))
         for method, one in figures.items()
