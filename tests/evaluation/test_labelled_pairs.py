@@ -127,9 +127,9 @@ def test_a_kitti_drive_without_a_labelled_pair_is_refused(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("name", "frames", "movers", "group"),
     [
-        ("0005", 10, 9, "kitti 400x120"),
-        ("0011", 43, 31, "kitti 1242x375"),
-        ("0027", 25, 25, "kitti 400x120"),
+        ("0005", 10, 18, "kitti 400x120"),
+        ("0011", 42, 29, "kitti 1242x375"),
+        ("0027", 25, 34, "kitti 400x120"),
     ],
 )
 def test_real_drives(name: str, frames: int, movers: int, group: str) -> None:
