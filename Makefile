@@ -1,6 +1,6 @@
 # make demo   a virtual environment of its own, then the main job on the bundled model and the bundled sample
 # make test   the gate: lint, format, strict types, import direction, tests with a branch-coverage floor
-# Others: lint, model (simulate, train, measure), evaluate, wheel, clean, distclean. Needs Python >= 3.11, make and git; fetches from package indexes only.
+# Others: lint, model (simulate, train, measure), evaluate, detection-suite, detection-ablations, wheel, clean, distclean. Needs Python >= 3.11, make and git; fetches from package indexes only.
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
@@ -31,7 +31,7 @@ MODEL_TRAINING := --set model.preset=calibrated --set training.learning_rate=0.0
 HELD_OUT_SEQUENCES ?= 12
 HELD_OUT_FRAMES ?= 20
 
-.PHONY: demo test lint model held-out evaluate wheel clean distclean
+.PHONY: demo test lint model held-out evaluate detection-suite detection-ablations wheel clean distclean
 
 $(VENV)/.torch: constraints.txt
 	@echo 'making $(VENV) with torch (once, some minutes)'
@@ -95,6 +95,13 @@ held-out: $(VENV)/.installed-dev
 evaluate: held-out
 	$(BIN)/viflow-anomaly evaluate flow $(MODEL_DIR)/held-out/* --out benchmarks/results/endpoint-error.json
 	$(BIN)/viflow-anomaly evaluate detect $(MODEL_DIR)/held-out/* --out benchmarks/results/detection.json
+
+# Regions of the bundled model: on sequences of fixed seeds of their own, and what each step of the detector is worth.
+detection-suite: $(VENV)/.installed-dev
+	$(BIN)/python benchmarks/detection_suite.py --jobs $(MODEL_JOBS)
+
+detection-ablations: held-out
+	$(BIN)/python benchmarks/detection_ablations.py $(MODEL_DIR)/held-out/*
 
 clean:
 	rm -rf build dist $(DEMO_OUT) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis .coverage
