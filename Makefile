@@ -1,6 +1,7 @@
 # make demo   a virtual environment of its own, then the main job on the bundled model and the bundled sample
 # make test   the gate: lint, format, strict types, import direction, tests with a branch-coverage floor
-# Others: lint, model (simulate, train, measure), evaluate, reproduction (the paper's table), wheel, clean, distclean. Needs Python >= 3.11, make and git; fetches from package indexes only.
+# Others: lint, model (simulate, train, measure), evaluate, reproduction (the paper's table), detection-suite,
+# detection-ablations, wheel, clean, distclean. Needs Python >= 3.11, make and git; fetches from package indexes only.
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
@@ -32,7 +33,7 @@ REPRODUCTION_DIR ?= runs/reproduction
 HELD_OUT_SEQUENCES ?= 12
 HELD_OUT_FRAMES ?= 20
 
-.PHONY: demo test lint model held-out evaluate reproduction wheel clean distclean
+.PHONY: demo test lint model held-out evaluate reproduction detection-suite detection-ablations wheel clean distclean
 
 $(VENV)/.torch: constraints.txt
 	@echo 'making $(VENV) with torch (once, some minutes)'
@@ -108,6 +109,13 @@ reproduction: $(VENV)/.installed-dev
 	simulate drone 70000 4 600 split
 	$(BIN)/python benchmarks/reproduction.py --data $(REPRODUCTION_DIR) --out benchmarks/results/reproduction \
 	  --jobs $(MODEL_JOBS) --checkpoint bundled=viflow_anomaly/weights/viflow-calibrated.safetensors
+
+# Regions of the bundled model: on sequences of fixed seeds of their own, and what each step of the detector is worth.
+detection-suite: $(VENV)/.installed-dev
+	$(BIN)/python benchmarks/detection_suite.py --jobs $(MODEL_JOBS)
+
+detection-ablations: held-out
+	$(BIN)/python benchmarks/detection_ablations.py $(MODEL_DIR)/held-out/*
 
 clean:
 	rm -rf build dist $(DEMO_OUT) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis .coverage

@@ -298,3 +298,19 @@ def test_a_device_that_is_not_there_is_refused(checkpoint: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         AnomalyDetector.from_checkpoint(checkpoint, device="cuda")
     assert caught.value.code == "device_unavailable"
+
+
+def test_the_smallest_residual_over_hypotheses_and_a_compensated_exposure(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    config = ModelConfig(preset="compact", hypotheses=4)
+    path = save_checkpoint(tmp_path / "four.safetensors", build_model(config), config, name="four", version="0")
+    detector = AnomalyDetector.from_checkpoint(path, config=DetectorConfig())
+    two = pair(texture(1), np.asarray(texture(1) * 0.8 + 10, dtype=np.uint8))
+    plain = detector.analyze(two)
+    least = detector.with_config(DetectorConfig(residual="minimum")).analyze(two)
+    assert (least.residual <= plain.residual).all()
+    assert least.residual.mean() < plain.residual.mean()
+    np.testing.assert_array_equal(least.inside, plain.inside)
+    for residual in ("winner", "minimum"):
+        judged = detector.with_config(DetectorConfig(residual=residual, photometric_compensation=True)).analyze(two)
+        assert judged.residual.mean() < 0.5 * plain.residual.mean()

@@ -8,7 +8,7 @@ from worlds import textured_image
 
 from viflow_anomaly.errors import TooLargeError
 from viflow_anomaly.geometry import pixel_grid
-from viflow_anomaly.residual import photometric_residual, reconstruct, texture_normalised
+from viflow_anomaly.residual import compensate_exposure, photometric_residual, reconstruct, texture_normalised
 
 H, W = 40, 56
 IMAGE = textured_image(W, H)
@@ -106,3 +106,33 @@ def test_a_misplaced_picture_leaves_less_evidence_than_something_new() -> None:
     evidence = texture_normalised(shifted, IMAGE, 10.0)
     flat = texture_normalised(shifted, np.full_like(IMAGE, 128), 10.0)
     assert evidence.mean() < 0.7 * flat.mean()
+
+
+def test_a_change_of_exposure_is_undone_and_a_mover_is_not() -> None:
+    source = textured_image(120, 90, seed=3)
+    reconstruction = (source.astype(np.float32) - 12) / 1.25
+    reconstruction[30:50, 40:60] += 60
+    inside = np.ones(source.shape, np.bool_)
+    inside[:, :10] = False
+    compensated = compensate_exposure(reconstruction, source, inside)
+    error = np.abs(compensated - source)
+    rest = inside.copy()
+    rest[30:50, 40:60] = False
+    assert error[rest].max() < 1.0
+    np.testing.assert_allclose(error[30:50, 40:60], 75, atol=1.0)
+    np.testing.assert_array_equal(compensated[:, :10], reconstruction[:, :10])
+
+
+def test_an_unchanged_exposure_stays() -> None:
+    source = textured_image(120, 90, seed=3)
+    same = compensate_exposure(source.astype(np.float32), source, np.ones(source.shape, np.bool_))
+    np.testing.assert_allclose(same, source, atol=1e-3)
+
+
+def test_nothing_is_compensated_where_nothing_can_be_told() -> None:
+    source = textured_image(120, 90, seed=3)
+    faint = source.astype(np.float32) / 4  # a gain of 4 is no exposure
+    few = np.zeros(source.shape, np.bool_)
+    few[:5, :5] = True
+    assert compensate_exposure(faint, source, np.ones(source.shape, np.bool_)) is faint
+    assert compensate_exposure(faint, source, few) is faint

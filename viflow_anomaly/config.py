@@ -192,6 +192,10 @@ class ModelConfig(FrozenConfig):
 MIN_SOFTENING_GRAY = 0.1
 
 
+ShapeRuleName = Literal["axis_aligned", "thickness", "oriented", "none"]
+"""See ``shape_rule``."""
+
+
 class RegionConfig(FrozenConfig):
     """From residual map to labelled regions; see ``regions.py`` for each step.
 
@@ -208,6 +212,9 @@ class RegionConfig(FrozenConfig):
     closing_fraction: float = Field(default=0.012, ge=0, le=0.1)
     min_area_fraction: float = Field(default=0.0006, ge=0, le=1, description="of the image's area")
     max_regions: int = Field(default=64, ge=1, le=4096)
+    shape_rule: ShapeRuleName = Field(
+        default="axis_aligned", description="what tells motion from narrow bands; axis_aligned: the paper's"
+    )
     min_x_extent_fraction: float = Field(default=0.018, ge=0, le=1, description="of the diagonal: narrower is a band")
     min_y_extent_fraction: float = Field(default=0.018, ge=0, le=1, description="of the diagonal: narrower is a band")
     max_aspect_ratio: float = Field(default=5.0, ge=1, description="a longer bounding box is a band")
@@ -255,6 +262,12 @@ class DetectorConfig(FrozenConfig):
     regions: RegionConfig = RegionConfig()
     correction: CorrectionConfig = CorrectionConfig()
     include_masks: bool = False
+    photometric_compensation: bool = Field(
+        default=False, description="a gain and a bias between the images are fitted before the residual"
+    )
+    residual: Literal["winner", "minimum"] = Field(
+        default="winner", description="minimum: the pixelwise smallest over all hypotheses and the corrected one"
+    )
     min_texture_gray: float = Field(default=2.0, ge=0, description="standard deviation below which nothing is judged")
     min_overlap: float = Field(default=0.05, ge=0, le=1, description="share of the analysed pixels still in the target")
     max_exposure_jump_gray: float = Field(default=40.0, ge=0, description="change of the mean between the frames")

@@ -27,7 +27,7 @@ from viflow_anomaly.geometry import Float32Array, pixel_grid
 from viflow_anomaly.model_input import ModelInput, prepare
 from viflow_anomaly.prediction import PredictedFlow, predict_flow
 from viflow_anomaly.regions import find_regions
-from viflow_anomaly.residual import photometric_residual, reconstruct, texture_normalised
+from viflow_anomaly.residual import compensate_exposure, photometric_residual, reconstruct, texture_normalised
 from viflow_anomaly.runtime.interface import Runtime
 from viflow_anomaly.runtime.loading import load_runtime
 from viflow_anomaly.sensor_data import FramePair
@@ -147,7 +147,7 @@ class AnomalyDetector:
         reconstruction, inside = reconstruct(pair.target.image, coordinates)
         if (analyzed := model_input.view.analyzed()) is not None:
             inside &= analyzed
-        residual = photometric_residual(pair.source.image, reconstruction, inside)
+        residual = self._residual(pair, model_input, predicted, reconstruction, inside)
         evidence = texture_normalised(residual, pair.source.image, self.config.regions.texture_softening_gray)
         inferred = time.perf_counter()
         x, y, region_width, region_height = model_input.view.region()
@@ -186,6 +186,30 @@ class AnomalyDetector:
             timings_ms=timings_ms,
         )
         return Analysis(detection, residual, evidence, inside, reconstruction, coordinates, predicted)
+
+    def _residual(
+        self,
+        pair: FramePair,
+        model_input: ModelInput,
+        predicted: PredictedFlow,
+        reconstruction: Float32Array,
+        inside: NDArray[np.bool_],
+    ) -> Float32Array:
+        """[H, W] of the winner, or the smallest over all hypotheses; an exposure may be compensated first."""
+        source = pair.source.image
+
+        def difference(rebuilt: Float32Array, where: NDArray[np.bool_]) -> Float32Array:
+            if self.config.photometric_compensation:
+                rebuilt = compensate_exposure(rebuilt, source, where)
+            return photometric_residual(source, rebuilt, where)
+
+        residual = difference(reconstruction, inside)
+        for flow_px in predicted.hypotheses_px if self.config.residual == "minimum" else ():
+            coordinates = model_input.view.target_coordinates(flow_px, predicted.stride)
+            rebuilt, reached = reconstruct(pair.target.image, coordinates)
+            both = inside & reached
+            np.minimum(residual, difference(rebuilt, both), out=residual, where=both)
+        return residual
 
     def _judge_input(self, pair: FramePair, model_input: ModelInput) -> tuple[tuple[Reason, ...], bool]:
         """What lowers trust in this pair, and whether it must not be judged."""

@@ -33,6 +33,7 @@ class PredictedFlow(NamedTuple):
         hypothesis_px: [h, w, 2] its flow as the network predicted it.
         correction: what the target image changed, None with correction off.
         measured: what the correction was made with.
+        hypotheses_px: [K, h, w, 2] float32, all that the network predicted.
     """
 
     flow_px: Float32Array
@@ -41,6 +42,7 @@ class PredictedFlow(NamedTuple):
     hypothesis_px: Float32Array
     correction: Correction | None
     measured: MeasuredFlow | None
+    hypotheses_px: Float32Array
 
 
 def predict_flow(
@@ -66,7 +68,7 @@ def correct(
     winner = choose_hypothesis(hypotheses, model_input.source, model_input.target)
     predicted = hypotheses.flow_px[winner]
     if not config.enabled:
-        return PredictedFlow(predicted, stride, winner, predicted, None, None)
+        return PredictedFlow(predicted, stride, winner, predicted, None, None, hypotheses.flow_px)
     measured = measure_flow(model_input.source, model_input.target, stride=stride, around=predicted)
     scene = hypotheses.scene
     focal_px = model_input.view.focal_px if scene is None else focal_px  # a scene's flow is in the network's own
@@ -77,7 +79,8 @@ def correct(
         correction = correct_flow(rays, hypotheses.flow_px, winner, measured, focal_px, config)
     else:
         correction = correct_motion(rays, scene.inverse_depth, scene.motion(winner), measured, focal_px, config)
-    return PredictedFlow(correction.flow_px, stride, winner, predicted, correction, measured)
+    flows_px = (correction.flow_px, stride, winner, predicted)
+    return PredictedFlow(*flows_px, correction, measured, hypotheses.flow_px)
 
 
 @lru_cache(maxsize=16)

@@ -1,8 +1,9 @@
 """Residual map -> regions of interest: smooth, threshold, clean up, label, judge the shape.
 
 The paper's way out of "model error also leaves a residual" [Limitations]: model error lies in narrow bands, long in X
-or in Y, rarely both; independent motion is extended in X and Y at once. The rule looks at the axis-aligned extents, so
-a *diagonal* thin band passes as motion; its thickness and fill ratio are in the evidence, and lower its score.
+or in Y, rarely both; independent motion is extended in X and Y at once. That rule looks at the axis-aligned extents, so
+a *diagonal* thin band passes as motion; its thickness and fill ratio are in the evidence, and lower its score. Other
+rules are in ``shape_rule``.
 
 Lengths in the configuration are fractions of the image diagonal, so that an image twice as large gives boxes twice as
 large and the same labels.
@@ -18,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import label as label_components
 
-from viflow_anomaly.config import RegionConfig
+from viflow_anomaly.config import RegionConfig, ShapeRuleName
 from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.shape_rule import ShapeLimits, judge_shape, thickness_px
 
 BoolArray = NDArray[np.bool_]
 IndexArray = NDArray[np.intp]
@@ -88,14 +90,6 @@ class _Level(NamedTuple):
     threshold_gray: float
 
 
-class _Limits(NamedTuple):
-    """The shape rule in pixels of this image."""
-
-    min_x_px: float
-    min_y_px: float
-    max_aspect_ratio: float
-
-
 class _Component(NamedTuple):
     """Pixels of one component in row-major order: rows y [n] and columns x [n]."""
 
@@ -121,13 +115,13 @@ def find_regions(
     closing_px = _odd_side_px(config.closing_fraction * diagonal_px)
     mask = _clean_mask(smoothed, inside, level, _odd_side_px(config.opening_fraction * diagonal_px), closing_px)
     components = _largest_components(mask, closing_px, config)
-    limits = _Limits(
+    limits = ShapeLimits(
         min_x_px=config.min_x_extent_fraction * diagonal_px,
         min_y_px=config.min_y_extent_fraction * diagonal_px,
         max_aspect_ratio=config.max_aspect_ratio,
     )
     regions = [
-        _judge(component, evidence, evidence if residual is None else residual, level, limits)
+        _judge(component, evidence, evidence if residual is None else residual, level, config.shape_rule, limits)
         for component in components
     ]
     regions.sort(key=lambda region: (-region.score, region.bbox.y, region.bbox.x))
@@ -204,7 +198,12 @@ def _component_labels(y: IndexArray, x: IndexArray, shape: tuple[int, ...], pitc
 
 
 def _judge(
-    component: _Component, evidence: Float32Array, residual: Float32Array, level: _Level, limits: _Limits
+    component: _Component,
+    evidence: Float32Array,
+    residual: Float32Array,
+    level: _Level,
+    rule: ShapeRuleName,
+    limits: ShapeLimits,
 ) -> Region:
     y, x = component
     left, top = int(x.min()), int(y[0])
@@ -216,20 +215,21 @@ def _judge(
     fill_ratio = values.size / mask.size
     aspect_ratio = max(box.width, box.height) / min(box.width, box.height)
     contrast = _contrast(evidence_gray, level)
-    rule = _shape_rule(box, limits)
-    label: RegionLabel = "independent_motion" if rule == "extended_in_x_and_y" else "model_error"
+    thickness = thickness_px(mask)
+    shape = judge_shape(rule, mask, thickness, limits)
+    label: RegionLabel = "independent_motion" if shape.passes else "model_error"
     return Region(
         label=label,
-        score=_score(label, box, contrast, fill_ratio, limits),
+        score=_score(label, contrast, fill_ratio, shape.nearness_to_band),
         bbox=box,
         x_extent_px=box.width,
         y_extent_px=box.height,
         area_px=int(values.size),
-        thickness_px=_thickness_px(mask),
+        thickness_px=thickness,
         residual_mean=float(values.mean()),
         residual_max=float(values.max()),
         evidence={
-            "rule": rule,
+            "rule": shape.verdict,
             "contrast": contrast,
             "threshold_gray": level.threshold_gray,
             "fill_ratio": fill_ratio,
@@ -239,49 +239,18 @@ def _judge(
     )
 
 
-def _shape_rule(box: BoundingBox, limits: _Limits) -> str:
-    """The paper's rule, and the limit on the aspect ratio that stops a long band of some thickness."""
-    narrow_in_x, narrow_in_y = box.width < limits.min_x_px, box.height < limits.min_y_px
-    if narrow_in_x and narrow_in_y:
-        return "narrow_in_x_and_y"
-    if narrow_in_x:
-        return "narrow_in_x"
-    if narrow_in_y:
-        return "narrow_in_y"
-    if max(box.width, box.height) > limits.max_aspect_ratio * min(box.width, box.height):
-        return "band_by_aspect_ratio"
-    return "extended_in_x_and_y"
-
-
 def _contrast(mean_gray: float, level: _Level) -> float:
     """Residual over background, in units of the threshold over background: 1 is at the threshold."""
     span_gray = max(level.threshold_gray - level.background_gray, 1e-6)
     return max(0.0, (mean_gray - level.background_gray) / span_gray)
 
 
-def _score(label: RegionLabel, box: BoundingBox, contrast: float, fill_ratio: float, limits: _Limits) -> float:
+def _score(label: RegionLabel, contrast: float, fill_ratio: float, nearness_to_band: float) -> float:
     """0.5 to 1 for independent motion, 0 to 0.5 for model error; rises with contrast, fill and distance from a band.
 
-    score = 0.5 [motion] + 0.5 * c / (1 + c) * sqrt(fill) * (1 - b / 2), where b in 0..1 says how near to a band the box
-    is: the largest of the three limits over the box's own value. Rounded, so that equal scores tie in the written
-    answer as well.
+    score = 0.5 [motion] + 0.5 * c / (1 + c) * sqrt(fill) * (1 - b / 2), where b in 0..1 says how near to a band the
+    region is (``Shape``). Rounded, so that equal scores tie in the written answer as well.
     """
-    nearness_to_band = max(
-        limits.min_x_px / box.width,
-        limits.min_y_px / box.height,
-        max(box.width, box.height) / (limits.max_aspect_ratio * min(box.width, box.height)),
-    )
     shape = 1.0 - 0.5 * min(nearness_to_band, 1.0)
     strength = contrast / (1.0 + contrast) * float(np.sqrt(fill_ratio)) * shape
     return round((0.5 if label == "independent_motion" else 0.0) + 0.5 * strength, 4)
-
-
-def _thickness_px(mask: BoolArray) -> float:
-    """Diameter of the largest disc inside the component; a line one pixel wide is 1 px thick.
-
-    The distance transform measures from a pixel's centre to the centre of the nearest pixel outside, half a pixel
-    beyond the edge.
-    """
-    padded = cv2.copyMakeBorder(mask.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT)
-    distance_px = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_5)
-    return float(2.0 * distance_px.max() - 1.0)

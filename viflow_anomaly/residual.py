@@ -20,6 +20,15 @@ BOUNDARY_TOLERANCE_PX = 1e-3
 """float32 coordinates a thousand pixels from the origin carry errors of 1e-4; such a coordinate is still inside."""
 
 
+EXPOSURE_SAMPLES = 5_000
+MIN_EXPOSURE_SAMPLES = 100
+EXPOSURE_ROUNDS = 6
+EXPOSURE_TOLERANCE_GRAY = 6.0
+EXPOSURE_PRIOR_GRAY = 2.0
+"""Deviation of the gray levels below which a gain cannot be told from a bias."""
+MAX_GAIN = 2.0
+
+
 def reconstruct(target: Uint8Array, target_coordinates: Float32Array) -> tuple[Float32Array, NDArray[np.bool_]]:
     """Sample the target image where each source pixel is predicted to have gone.
 
@@ -55,6 +64,40 @@ def photometric_residual(source: Uint8Array, reconstruction: Float32Array, insid
     difference = cv2.absdiff(source.astype(np.float32), reconstruction)
     np.copyto(difference, 0.0, where=~inside)
     return np.asarray(difference, dtype=np.float32)
+
+
+def compensate_exposure(reconstruction: Float32Array, source: Uint8Array, inside: NDArray[np.bool_]) -> Float32Array:
+    """gain * reconstruction + bias, the nearest to the source: a change of exposure is no motion.
+
+    Robust least squares (Cauchy weights, half at ``EXPOSURE_TOLERANCE_GRAY``) on a lattice of the inside pixels, from
+    "no change" on, so that movers do not pull. Where too few pixels share a part of the scene, or a gain would be
+    beyond ``MAX_GAIN``, nothing is compensated.
+
+    Args:
+        reconstruction: [H, W] float32 gray levels.
+        source: [H, W] uint8.
+        inside: [H, W]; elsewhere the result is the reconstruction.
+    """
+    stride = max(1, int(np.sqrt(source.size / EXPOSURE_SAMPLES)))
+    thin = (slice(None, None, stride),) * 2
+    chosen = inside[thin]
+    x, y = reconstruction[thin][chosen].astype(np.float64), source[thin][chosen].astype(np.float64)
+    if x.size < MIN_EXPOSURE_SAMPLES:
+        return reconstruction
+    gain, bias = 1.0, float(np.median(y - x))
+    for _ in range(EXPOSURE_ROUNDS):
+        error = (gain * x + bias - y) / EXPOSURE_TOLERANCE_GRAY
+        weights = 1 / (1 + error * error)
+        middle_x, middle_y = np.average(x, weights=weights), np.average(y, weights=weights)
+        spread = (weights * (x - middle_x) ** 2).sum()
+        # A uniform picture says nothing of the gain: the prior keeps it at 1.
+        prior = EXPOSURE_PRIOR_GRAY**2 * weights.sum()
+        gain = float(((weights * (x - middle_x) * (y - middle_y)).sum() + prior) / (spread + prior))
+        bias = float(middle_y - gain * middle_x)
+    if not 1 / MAX_GAIN <= gain <= MAX_GAIN:
+        return reconstruction
+    compensated = reconstruction * np.float32(gain) + np.float32(bias)
+    return np.asarray(np.where(inside, compensated, reconstruction), dtype=np.float32)
 
 
 def texture_normalised(residual: Float32Array, source: Uint8Array, softening_gray: float) -> Float32Array:

@@ -225,22 +225,46 @@ def test_the_processor_has_a_name_everywhere(monkeypatch: pytest.MonkeyPatch, co
 # --- evaluate detect
 
 
-def test_detection_json_and_table(ask: Ask, checkpoint: Path, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def labelled(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("labelled")
     frames = {"drone_000001": 3, "drone_000002": 2, "car_000001": 2}
-    folders = [add_movers(add_ground_truth(tmp_path / name, make_world(frames=n))) for name, n in frames.items()]
-    command = ["evaluate", "detect", *map(str, folders), "--checkpoint", str(checkpoint)]
-    answer = ask([*command, "--no-rivals", "--json", "--out", str(tmp_path / "detect.json")])
+    return [add_movers(add_ground_truth(folder / name, make_world(frames=n))) for name, n in frames.items()]
+
+
+def detect(labelled: list[Path], checkpoint: Path, *more: str) -> list[str]:
+    return ["evaluate", "detect", *map(str, labelled), "--checkpoint", str(checkpoint), *more]
+
+
+def test_detection_json_and_files(ask: Ask, labelled: list[Path], checkpoint: Path, tmp_path: Path) -> None:
+    out, text, plots = tmp_path / "detect.json", tmp_path / "detect.md", tmp_path / "plots"
+    files = ["--out", str(out), "--markdown", str(text), "--plots", str(plots)]
+    answer = ask(detect(labelled, checkpoint, "--no-rivals", "--json", *files))
     assert (answer.code, answer.err) == (0, "")
     report: dict[str, Any] = json.loads(answer.out)
-    assert json.loads((tmp_path / "detect.json").read_text()) == report
+    assert json.loads(out.read_text()) == report
     assert {name: one["viflow-anomaly"]["frames"] for name, one in report["groups"].items()} == {"car": 1, "drone": 3}
+    assert {name: one["viflow-anomaly"]["movers"] for name, one in report["groups"].items()} == {"car": 1, "drone": 3}
+    assert list(report["sequences"]) == ["car_000001", "drone_000001", "drone_000002"]
     assert report["detector"]["correction"]["enabled"] is True
-    table = ask(command).out
-    assert "homography difference" in table
-    assert "ROI AP" in table
+    assert text.read_text().startswith("# Regions against ground truth")
+    assert (plots / "precision-recall-all.png").is_file()
+
+
+def test_detection_table(ask: Ask, labelled: list[Path], checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "170")
+    table = ask(detect(labelled, checkpoint, "--every", "2")).out
+    for text in ("homography difference", "plain residual", "gyro difference", "ROI AP", "alarms/frame", "@0.01"):
+        assert text in table
 
 
 def test_detection_refuses_what_it_cannot_judge(ask: Ask, checkpoint: Path, tmp_path: Path) -> None:
-    plain = write_euroc(tmp_path / "V1_01")
-    command = ["evaluate", "detect", str(plain), "--checkpoint", str(checkpoint)]
-    assert ask(command).is_refusal("[ground_truth_missing]")
+    assert ask(detect([write_euroc(tmp_path / "V1_01")], checkpoint)).is_refusal("[ground_truth_missing]")
+
+
+def test_detection_needs_matplotlib_for_charts(
+    ask: Ask, labelled: list[Path], checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("viflow_anomaly.evaluation.plot_style.find_spec", lambda name: None)
+    answer = ask(detect(labelled, checkpoint, "--plots", str(tmp_path / "plots")))
+    assert answer.is_refusal("[plots_unavailable]")

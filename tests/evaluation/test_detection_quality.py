@@ -1,64 +1,92 @@
-"""Labels, rivals and the whole measurement on drawn worlds."""
+"""The measurement: what is judged, what is added up, which thresholds a rival gets."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from drawn_methods import ELSEWHERE, HIGH, LOW, MOVER, DrawnMethod, DrawnPairs
 from simulated_truth import add_ground_truth, add_movers
-from worlds import make_world, textured_image, write_euroc
+from worlds import make_world
 
 from viflow_anomaly.checkpoint import save_checkpoint
-from viflow_anomaly.config import ModelConfig
-from viflow_anomaly.datasets.registry import open_recording
-from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
+from viflow_anomaly.config import DetectorConfig, ModelConfig, RegionConfig
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import DatasetError
-from viflow_anomaly.evaluation.detection_quality import OURS, measure_detection
-from viflow_anomaly.evaluation.labelled_pairs import TrueObject, labels_of
-from viflow_anomaly.evaluation.rivals import RIVALS
+from viflow_anomaly.evaluation.detection_methods import (
+    OURS,
+    PLAIN_RESIDUAL,
+    RIVAL_THRESHOLDS,
+    DetectorMethod,
+    RivalMethod,
+    Thresholds,
+    plain_residual,
+    rival_methods,
+)
+from viflow_anomaly.evaluation.detection_quality import MethodScores, SequenceKey, measure_detection
+from viflow_anomaly.evaluation.labelled_pairs import open_labelled
+from viflow_anomaly.evaluation.rivals import RIVALS, Evidence
 from viflow_anomaly.model.builder import build_model
-from viflow_anomaly.regions import BoundingBox
-from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples, Uint8Array
+from viflow_anomaly.sensor_data import FramePair
 
-STAMPS = np.arange(0, 100_000_001, 5_000_000)
-IMU = ImuSamples(STAMPS, np.zeros((len(STAMPS), 3)), np.tile((0.0, -9.81, 0.0), (len(STAMPS), 1)))
-
-
-def pair(source: Uint8Array, target: Uint8Array) -> FramePair:
-    return FramePair(Frame(20_000_000, source), Frame(70_000_000, target), IMU, None)
+GOOD = DrawnMethod("good", {LOW: [(MOVER, 0.9)]})
+# Under LOW the false alarm comes first, under HIGH there is none.
+RIVAL = DrawnMethod("rival", {LOW: [(MOVER, 0.7), (ELSEWHERE, 0.8)], HIGH: [(MOVER, 0.6)]}, rival=True)
 
 
-def moving_square() -> FramePair:
-    """The camera pans by 3 px; a square of another texture goes 8 px the other way."""
-    texture, square = textured_image(170, 120, seed=1), textured_image(30, 30, seed=2)
-    source, target = texture[:, 3:163].copy(), texture[:, :160].copy()
-    source[40:70, 60:90], target[40:70, 52:82] = square, square
-    return pair(source, target)
+def test_groups_sequences_and_everything() -> None:
+    sequences = [DrawnPairs("drone_1", "drone", 2), DrawnPairs("drone_2", "drone", 3), DrawnPairs("car_1", "car", 1)]
+    steps: list[tuple[int, int]] = []
+    run = measure_detection([GOOD, RIVAL], sequences, on_progress=lambda done, total: steps.append((done, total)))
+    assert steps == [(k, 6) for k in range(1, 7)]
+    assert list(run.sequences) == [SequenceKey("drone", "drone_1"), SequenceKey("drone", "drone_2"), ("car", "car_1")]
+    frames = {name: by["good"].findings[LOW].boxes.frames for name, by in run.groups().items()}
+    assert frames == {"car": 1, "drone": 5}
+    total = run.total()["good"].findings[LOW].boxes.summary()
+    assert (total["frames"], total["movers"], total["roi_ap"], total["seconds"]) == (6, 6, 1.0, 0.6)
+    assert run.total()["good"].pixels.average_precision() == pytest.approx(1.0)
+    assert run.total()["good"].findings[LOW].masks.iou() == 1.0
 
 
-@pytest.mark.parametrize("name", [name for name in RIVALS if name != "frame difference"])
-def test_a_rival_sees_the_square_and_not_the_pan(name: str) -> None:
-    evidence, inside = RIVALS[name](moving_square())
-    assert evidence.shape == inside.shape == (120, 160)
-    assert evidence.dtype == np.float32
-    background = evidence[10:110, 100:150].mean()
-    assert evidence[44:66, 64:86].mean() > 4 * background
+def test_a_rival_gets_the_thresholds_that_are_best_for_it() -> None:
+    run = measure_detection([RIVAL], [DrawnPairs("drone_1", "drone")])
+    scores = run.total()["rival"]
+    assert scores.findings[LOW].boxes.average_precision() == 0.5
+    assert scores.best() == HIGH
+    assert measure_detection([RIVAL], [DrawnPairs("a_1", "a", movers=())]).total()["rival"].best() is None
+    assert MethodScores().best() is None
 
 
-def test_the_frame_difference_sees_both() -> None:
-    evidence, inside = RIVALS["frame difference"](moving_square())
-    assert inside.all()
-    assert evidence[10:110, 100:150].mean() > 0.3 * evidence[44:66, 64:86].mean()
+def test_every_nth_pair() -> None:
+    run = measure_detection([GOOD], [DrawnPairs("drone_1", "drone", 5), DrawnPairs("car_1", "car", 2)], every=2)
+    assert run.total()["good"].findings[LOW].boxes.frames == 4
 
 
-@pytest.mark.parametrize("name", RIVALS)
-def test_rivals_take_pictures_without_anything_to_track(name: str) -> None:
-    flat = np.full((64, 96), 90, np.uint8)
-    evidence, _ = RIVALS[name](pair(flat, flat))
-    assert np.isfinite(evidence).all()
-    assert evidence.max() < 1.0
+def test_boxes_alone_give_no_pixel_measure() -> None:
+    scores = measure_detection([GOOD], [DrawnPairs("kitti_1", "kitti", masks=False)]).total()["good"]
+    assert scores.findings[LOW].boxes.average_precision() == 1.0
+    assert (scores.pixels.frames, scores.findings[LOW].masks.iou()) == (0, None)
+
+
+def test_a_pair_that_cannot_be_used_counts_for_no_method() -> None:
+    run = measure_detection([GOOD, RIVAL], [DrawnPairs("drone_1", "drone", 3, unusable=[1])])
+    assert run.skipped == {"imu_not_covering": 1}
+    assert {by.findings[LOW].boxes.frames for by in run.total().values()} == {2}
+    with pytest.raises(DatasetError) as caught:
+        measure_detection([GOOD], [DrawnPairs("drone_1", "drone", 2, unusable=[0, 1])])
+    assert caught.value.code == "ground_truth_missing"
+
+
+def test_a_method_without_an_answer_is_left_out_where_it_has_none() -> None:
+    silent = DrawnMethod("silent", {LOW: []}, answers=lambda pair: False)
+    run = measure_detection([GOOD, silent], [DrawnPairs("drone_1", "drone")])
+    assert list(run.total()) == ["good"]
+    assert list(run.rivals) == ["good", "silent"]
+
+
+def test_each_method_sees_the_motor_command_that_it_needs() -> None:
+    plain, motor = DrawnMethod("plain", {LOW: []}), DrawnMethod("motor", {LOW: []}, motor_source="command")
+    measure_detection([plain, motor], [DrawnPairs("drone_1", "drone", 1)])
+    assert [pair.motor_command is None for pair in (*plain.seen, *motor.seen)] == [True, False]
 
 
 @pytest.fixture(scope="module")
@@ -68,39 +96,52 @@ def detector(tmp_path_factory: pytest.TempPathFactory) -> AnomalyDetector:
     return AnomalyDetector.from_checkpoint(save_checkpoint(path, build_model(config), config, name="m", version="0"))
 
 
-def test_labels_come_from_the_ground_truth(tmp_path: Path) -> None:
-    folder = add_movers(add_ground_truth(tmp_path / "drone_1", make_world(frames=3)))
-    truth = SimulatedGroundTruth.find(folder)
-    assert truth is not None
-    labels = labels_of(truth, int(open_recording(folder).frame_timestamps_ns[0]))
-    assert labels.objects == (
-        TrueObject(BoundingBox(30, 10, 14, 10), 4.0, counted=True),
-        TrueObject(BoundingBox(5, 30, 10, 10), 0.5, counted=False),
-    )
-    assert (labels.moving.sum(), labels.ignored.sum()) == (140, 100)
-    assert labels.moving[10, 30]
-    assert labels.ignored[39, 14]
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> FramePair:
+    folder = tmp_path_factory.mktemp("world") / "drone_1"
+    return open_labelled(add_movers(add_ground_truth(folder, make_world(frames=3)))).pair(0)
 
 
-def test_ours_and_all_rivals_are_measured_by_group(detector: AnomalyDetector, tmp_path: Path) -> None:
-    folders = [
-        add_movers(add_ground_truth(tmp_path / name, make_world(frames=3))) for name in ("drone_1", "drone_2", "car_1")
-    ]
-    steps: list[tuple[int, int]] = []
-    table = measure_detection(detector, folders, on_progress=lambda done, total: steps.append((done, total)))
-    assert list(table) == ["car", "drone"]
-    assert set(table["drone"]) == {OURS, *RIVALS}
-    assert {one["frames"] for one in table["drone"].values()} == {4}
-    assert {one["frames"] for one in table["car"].values()} == {2}
-    assert {one["movers"] for one in table["drone"].values()} == {4}
-    assert steps == [(1, 3), (2, 3), (3, 3)]
-    alone = measure_detection(detector, folders[:1], every=2, rivals=False)
-    assert (list(alone["drone"]), alone["drone"][OURS]["frames"]) == ([OURS], 1)
+def test_a_detector_is_measured_as_a_user_runs_it(detector: AnomalyDetector, two: FramePair) -> None:
+    regions = RegionConfig(min_residual_gray=3.0, threshold_mads=2.0)
+    configured = detector.with_config(DetectorConfig(regions=regions))
+    method = DetectorMethod(OURS, configured)
+    judgement = method.judge(two)
+    detection = configured.detect(two)
+    (finding,) = judgement.findings
+    assert finding.thresholds == Thresholds(2.0, 3.0)
+    assert len(finding.boxes) == len(detection.rois) > 0
+    assert [box.score for box in finding.boxes] == [roi.score for roi in detection.rois]
+    areas = [roi.area_px for roi in detection.rois if roi.label == "independent_motion"]
+    assert np.count_nonzero(finding.motion) == sum(areas)
+    assert not method.rival
 
 
-def test_a_recording_without_ground_truth_is_refused(detector: AnomalyDetector, tmp_path: Path) -> None:
-    alone = add_movers(add_ground_truth(tmp_path / "drone_1", make_world(frames=1)))
-    for folder in (write_euroc(tmp_path / "V1_01"), alone):
-        with pytest.raises(DatasetError) as caught:
-            measure_detection(detector, [folder])
-        assert caught.value.code == "ground_truth_missing"
+def test_a_rival_is_cut_at_every_threshold_with_the_papers_rule(two: FramePair) -> None:
+    evidence = np.zeros(two.source.image.shape, np.float32)
+    evidence[5:25, 5:25] = 30.0
+    inside = np.ones(evidence.shape, np.bool_)
+    config = RegionConfig(shape_rule="none", smoothing_fraction=0, opening_fraction=0, closing_fraction=0)
+    method = RivalMethod("drawn", lambda _: Evidence(evidence, inside), config)
+    judgement = method.judge(two)
+    assert judgement is not None
+    assert tuple(finding.thresholds for finding in judgement.findings) == RIVAL_THRESHOLDS
+    found = {finding.thresholds.min_residual_gray: len(finding.boxes) for finding in judgement.findings}
+    assert found == {6.0: 1, 12.0: 1, 24.0: 1, 48.0: 0}
+    assert np.count_nonzero(judgement.findings[0].motion) == 400
+    assert RivalMethod("silent", lambda _: None, config).judge(two) is None
+
+
+def test_the_plain_residual_is_the_papers_whatever_is_configured(detector: AnomalyDetector, two: FramePair) -> None:
+    fancy = DetectorConfig(photometric_compensation=True, residual="minimum")
+    judged = [plain_residual(detector.with_config(config)).judge(two) for config in (fancy, DetectorConfig())]
+    off = DetectorConfig.model_validate({"correction": {"enabled": False}, "regions": {"texture_softening_gray": 0}})
+    paper = DetectorMethod("paper", detector.with_config(off)).judge(two)
+    for judgement in judged:
+        assert judgement is not None
+        np.testing.assert_array_equal(judgement.evidence, paper.evidence)
+
+
+def test_all_rivals_or_some(detector: AnomalyDetector) -> None:
+    assert [method.name for method in rival_methods(detector)] == [PLAIN_RESIDUAL, *RIVALS]
+    assert [method.name for method in rival_methods(detector, ["gyro difference"])] == ["gyro difference"]

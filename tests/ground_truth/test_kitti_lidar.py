@@ -9,9 +9,9 @@ import pytest
 from lidar_drive import CAMERA, POST_M, SPEED_M, WALL_M, drive_world, scan_of, wall_and_post, write_drive
 from worlds import stamp_text, write_lines
 
+from viflow_anomaly.datasets.kitti_labels import MOTION_COLUMNS
 from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
 from viflow_anomaly.errors import DatasetError
-from viflow_anomaly.ground_truth.kitti_boxes import MOTION_COLUMNS
 from viflow_anomaly.ground_truth.kitti_lidar import read_scan, render_lidar
 
 STAMPS = drive_world().frame_timestamps_ns.tolist()

@@ -11,13 +11,11 @@ import typer
 
 from viflow_anomaly.cli.options import AsJson, Assignments, ConfigFile, Device, Threads, settings_from
 from viflow_anomaly.cli.progress import stderr_progress
+from viflow_anomaly.cli.tables import rich_table
 
 if TYPE_CHECKING:
-    from rich.table import Table as RichTable
-
     from viflow_anomaly.evaluation.flow_methods import FlowMethod, NetworkMethod
     from viflow_anomaly.evaluation.flow_run import FlowMeasurement
-    from viflow_anomaly.evaluation.flow_tables import Table
     from viflow_anomaly.evaluation.flow_truth import FlowTruth, RecordingTruth
     from viflow_anomaly.evaluation.sceneflow_truth import SceneFlowTruth
     from viflow_anomaly.settings import Settings
@@ -284,26 +282,10 @@ def _print(report: dict[str, Any]) -> None:
 
     console = Console()
     for table in report_tables(report):
-        console.print(_rich_table(table))
+        console.print(rich_table(table))
     for line in notes(report):
         console.print(line, markup=False, highlight=False)
-    console.print(_rich_table(paper_table(report)))
-
-
-def _rich_table(table: Table) -> RichTable:
-    from rich.box import SIMPLE
-    from rich.markup import escape
-    from rich.table import Column
-    from rich.table import Table as RichTable
-
-    columns = [
-        Column(head, justify="left" if k < table.text_columns else "right", no_wrap=k == 0)
-        for k, head in enumerate(table.heads)
-    ]
-    shown = RichTable(*columns, box=SIMPLE, title=escape(table.title), title_justify="left", padding=(0, 1, 0, 0))
-    for row in table.rows:
-        shown.add_row(*map(escape, row))
-    return shown
+    console.print(rich_table(paper_table(report)))
 
 
 def _draw(

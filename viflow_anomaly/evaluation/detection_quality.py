@@ -1,4 +1,4 @@
-"""Ours and its rivals on labelled sequences: the same regions, the same ruler, thresholds that favour the rivals.
+"""The measurement: every method on the same labelled pairs, the same regions and the same ruler.
 
 A rival's thresholds are those of ``RIVAL_THRESHOLDS`` that give its best average precision on the very frames it is
 judged on; ours are the configuration's.
@@ -6,109 +6,155 @@ judged on; ours are the configuration's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
-import cv2
-import numpy as np
-
-from viflow_anomaly.config import RegionConfig
-from viflow_anomaly.detector import AnomalyDetector
-from viflow_anomaly.evaluation.detection_scores import DetectionScores, ScoredBox
-from viflow_anomaly.evaluation.flow_truth import RecordingTruth
-from viflow_anomaly.evaluation.labelled_pairs import BoolArray, Labels, labels_of
-from viflow_anomaly.evaluation.rivals import RIVALS
-from viflow_anomaly.geometry import Float32Array
-from viflow_anomaly.regions import BoundingBox, find_regions
+from viflow_anomaly.config import MotorSource
+from viflow_anomaly.errors import DatasetError, InvalidInputError
+from viflow_anomaly.evaluation.detection_methods import DetectionMethod, Judgement, Thresholds
+from viflow_anomaly.evaluation.detection_scores import DetectionScores
+from viflow_anomaly.evaluation.labelled_pairs import LabelledPairs, Labels, every_nth
+from viflow_anomaly.evaluation.pixel_scores import MaskScores, PixelScores
 from viflow_anomaly.sensor_data import FramePair
 
-RIVAL_THRESHOLDS = tuple((mads, gray) for mads in (3.0, 6.0, 12.0) for gray in (6.0, 12.0, 24.0, 48.0))
-EVIDENCE_SCALE_GRAY = 64.0
-"""Evidence at which the pixel measure is half saturated; any monotone scale gives the same average precision."""
-PIXEL_SMOOTHING_PX = 1.2
-OURS = "viflow-anomaly"
 
-Table = dict[str, dict[str, dict[str, Any]]]
+@dataclass
+class FindingScores:
+    """Under one pair of thresholds: boxes, and the pixels of what is labelled as motion."""
+
+    boxes: DetectionScores = field(default_factory=DetectionScores)
+    masks: MaskScores = field(default_factory=MaskScores)
+
+    def merge(self, other: FindingScores) -> None:
+        """Count all of ``other``, too."""
+        self.boxes.merge(other.boxes)
+        self.masks.merge(other.masks)
+
+
+@dataclass
+class MethodScores:
+    """One method on some pairs: findings by thresholds, pixels (which know no threshold)."""
+
+    findings: dict[Thresholds, FindingScores] = field(default_factory=dict)
+    pixels: PixelScores = field(default_factory=PixelScores)
+
+    def add(self, judgement: Judgement, labels: Labels, seconds: float) -> None:
+        """Count one pair."""
+        for thresholds, boxes, motion in judgement.findings:
+            scores = self.findings.setdefault(thresholds, FindingScores())
+            scores.boxes.add_frame(boxes, labels, seconds)
+            if labels.pixels is not None:
+                scores.masks.add(motion, judgement.inside, labels.pixels)
+        if labels.pixels is not None:
+            self.pixels.add(judgement.evidence, judgement.inside, labels.pixels)
+
+    def merge(self, other: MethodScores) -> None:
+        """Count all of ``other``, too."""
+        for thresholds, scores in other.findings.items():
+            self.findings.setdefault(thresholds, FindingScores()).merge(scores)
+        self.pixels.merge(other.pixels)
+
+    def best(self) -> Thresholds | None:
+        """The thresholds of the best average precision of boxes; None where there was nothing to find."""
+        precisions = {key: scores.boxes.average_precision() for key, scores in self.findings.items()}
+        known = {key: value for key, value in precisions.items() if value is not None}
+        return max(known, key=lambda key: known[key]) if known else None
+
+
+ByMethod = dict[str, MethodScores]
+
+
+class SequenceKey(NamedTuple):
+    """A sequence, and the group that it belongs to."""
+
+    group: str
+    sequence: str
+
+
+@dataclass(frozen=True)
+class DetectionMeasurement:
+    """What a run found.
+
+    Attributes:
+        rivals: method -> whether thresholds are chosen for it, in the order that they were given.
+        sequences: scores by sequence and method; a method without any answer there is not in them.
+        skipped: pairs that were judged by no method (no usable IMU), by reason.
+    """
+
+    rivals: Mapping[str, bool]
+    sequences: Mapping[SequenceKey, ByMethod]
+    skipped: Mapping[str, int] = field(default_factory=dict)
+
+    def groups(self) -> dict[str, ByMethod]:
+        """By group, sorted."""
+        names = sorted({key.group for key in self.sequences})
+        return {name: self._merged(some for key, some in self.sequences.items() if key.group == name) for name in names}
+
+    def total(self) -> ByMethod:
+        """Of all pairs."""
+        return self._merged(self.sequences.values())
+
+    def _merged(self, parts: Iterable[ByMethod]) -> ByMethod:
+        merged: ByMethod = {name: MethodScores() for name in self.rivals}
+        for part in parts:
+            for name, scores in part.items():
+                merged[name].merge(scores)
+        return {name: scores for name, scores in merged.items() if scores.findings}
 
 
 def measure_detection(
-    detector: AnomalyDetector,
-    recordings: Sequence[Path],
+    methods: Sequence[DetectionMethod],
+    sequences: Sequence[LabelledPairs],
     *,
     every: int = 1,
-    rivals: bool = True,
     on_progress: Callable[[int, int], None] | None = None,
-) -> Table:
-    """Figures by group of sequences (the name up to its first underscore) and method.
+) -> DetectionMeasurement:
+    """Judge every n-th pair of each sequence by every method.
 
     Args:
-        detector: ours.
-        recordings: simulated sequences with ground truth.
-        every: take every n-th pair of each.
-        rivals: measure the classical methods, too.
-        on_progress: called with (done, total) after each recording.
+        methods: with names that differ.
+        sequences: with labels.
+        every: n.
+        on_progress: called with (done, total) after each pair.
 
     Raises:
-        DatasetError: ``ground_truth_missing`` for a recording without ground truth or pairs, before anything is
-            measured; as ``open_recording``.
+        DatasetError: ``ground_truth_missing`` when no pair can be judged; as the sequences raise.
     """
-    groups: dict[str, dict[str, dict[tuple[float, float], DetectionScores]]] = {}
-    opened = [RecordingTruth(path) for path in recordings]
-    for done, truth in enumerate(opened, start=1):
-        group = groups.setdefault(truth.sequence.split("_", 1)[0], {})
-        for index in range(0, len(truth), every):
-            pair = truth.pair(index, detector.motor_source)
-            labels = labels_of(truth.ground_truth, pair.source.timestamp_ns)
-            _add_ours(group, detector, pair, labels)
-            if rivals:
-                _add_rivals(group, detector.config.regions, pair, labels)
+    assert len({method.name for method in methods}) == len(methods)
+    chosen = every_nth(sequences, every)
+    scores: dict[SequenceKey, ByMethod] = {}
+    skipped: Counter[str] = Counter()
+    for done, (pairs, index) in enumerate(chosen, start=1):
+        try:
+            judgements = _judge(methods, pairs, index)
+        except InvalidInputError as err:
+            skipped[err.code] += 1
+        else:
+            by_method = scores.setdefault(SequenceKey(pairs.group, pairs.sequence), {})
+            labels = pairs.labels(index)
+            for name, (judgement, seconds) in judgements.items():
+                by_method.setdefault(name, MethodScores()).add(judgement, labels, seconds)
         if on_progress is not None:
-            on_progress(done, len(recordings))
-    return {name: {method: _best(scores) for method, scores in group.items()} for name, group in sorted(groups.items())}
+            on_progress(done, len(chosen))
+    if sum(skipped.values()) == len(chosen):
+        raise DatasetError(
+            f"expected a pair that can be judged, found none among {len(chosen)} (left out: {dict(skipped)})",
+            code="ground_truth_missing",
+        )
+    return DetectionMeasurement({method.name: method.rival for method in methods}, scores, dict(skipped))
 
 
-def _add_ours(
-    group: dict[str, dict[tuple[float, float], DetectionScores]],
-    detector: AnomalyDetector,
-    pair: FramePair,
-    labels: Labels,
-) -> None:
-    regions = detector.config.regions
-    key = (regions.threshold_mads, regions.min_residual_gray)
-    scores = group.setdefault(OURS, {}).setdefault(key, DetectionScores())
-    analysis = detector.analyze(pair)
-    boxes = [(roi.bbox, roi.score) for roi in analysis.detection.rois]
-    found = [ScoredBox(BoundingBox(box.x, box.y, box.width, box.height), score) for box, score in boxes]
-    scores.add_frame(found, labels)
-    _add_pixels(scores, analysis.evidence, analysis.inside, labels)
-
-
-def _add_rivals(
-    group: dict[str, dict[tuple[float, float], DetectionScores]],
-    config: RegionConfig,
-    pair: FramePair,
-    labels: Labels,
-) -> None:
-    for name, rival in RIVALS.items():
-        evidence, inside = rival(pair)
-        for mads, gray in RIVAL_THRESHOLDS:
-            scores = group.setdefault(name, {}).setdefault((mads, gray), DetectionScores())
-            thresholds = config.model_copy(update={"threshold_mads": mads, "min_residual_gray": gray})
-            found = find_regions(evidence, inside, thresholds).regions
-            scores.add_frame([ScoredBox(region.bbox, region.score) for region in found], labels)
-            if (mads, gray) == RIVAL_THRESHOLDS[0]:  # pixels know no threshold
-                _add_pixels(scores, evidence, inside, labels)
-
-
-def _add_pixels(scores: DetectionScores, evidence: Float32Array, inside: BoolArray, labels: Labels) -> None:
-    smoothed = cv2.GaussianBlur(evidence, (0, 0), PIXEL_SMOOTHING_PX)
-    scores.add_pixels(np.asarray(smoothed / (smoothed + EVIDENCE_SCALE_GRAY), dtype=np.float32), inside, labels)
-
-
-def _best(by_threshold: dict[tuple[float, float], DetectionScores]) -> dict[str, Any]:
-    """The figures at the thresholds with the best average precision; the pixel measure is of the first."""
-    summaries = {key: scores.summary() for key, scores in by_threshold.items()}
-    best = max(summaries, key=lambda key: summaries[key]["roi_ap"] or 0.0)
-    pixel_ap = next(iter(summaries.values()))["pixel_ap"]
-    return {**summaries[best], "pixel_ap": pixel_ap, "threshold_mads": best[0], "min_residual_gray": best[1]}
+def _judge(methods: Sequence[DetectionMethod], pairs: LabelledPairs, index: int) -> dict[str, tuple[Judgement, float]]:
+    """Each method's answer with the seconds to the next frame; a pair counts for all methods or for none."""
+    read: dict[MotorSource | None, FramePair] = {}
+    for motor_source in {method.motor_source for method in methods}:
+        read[motor_source] = pairs.pair(index, motor_source)
+    answers = {}
+    for method in methods:
+        pair = read[method.motor_source]
+        judgement = method.judge(pair)
+        if judgement is not None:
+            answers[method.name] = (judgement, pair.interval_ns * 1e-9)
+    return answers

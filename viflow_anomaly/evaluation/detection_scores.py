@@ -1,25 +1,41 @@
-"""How good regions are: average precision of boxes, recall at a rate of false alarms, average precision of pixels."""
+"""How good regions are: precision and recall of boxes, average precision, recall at a rate of false alarms."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from viflow_anomaly.evaluation.labelled_pairs import BoolArray, Labels
-from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.evaluation.labelled_pairs import Labels, TrueObject
+from viflow_anomaly.evaluation.pixel_scores import average_precision
 from viflow_anomaly.regions import BoundingBox
 
 MIN_IOU = 0.3
 """A region finds a mover when their boxes overlap this much."""
 IGNORED_SHARE = 0.5
 """A region that lies this far in ignored boxes is neither right nor wrong."""
-PIXEL_BINS = 512
 MOTION_SCORE = 0.5
 """Regions labelled ``independent_motion`` score at least this, others less; curves are over all of them."""
+FALSE_ALARM_RATES = (0.1, 0.01)
+"""False alarms a frame at which recall is told."""
+
+SIZE_CLASSES: dict[str, tuple[float, float]] = {
+    "small": (0, 400),
+    "medium": (400, 2500),
+    "large": (2500, float("inf")),
+}
+"""Area of a mover's box in pixels, from the first up to below the second: 20 x 20 and 50 x 50."""
+SPEED_CLASSES: dict[str, tuple[float, float]] = {
+    "slow": (0, 2),
+    "medium": (2, 5),
+    "fast": (5, float("inf")),
+}
+"""Independent motion in pixels a frame, likewise."""
+
+Curve = NDArray[np.float64]
 
 
 class ScoredBox(NamedTuple):
@@ -30,86 +46,127 @@ class ScoredBox(NamedTuple):
 
 
 class _Judged(NamedTuple):
+    """A region that counts: what it found, or None for a false alarm."""
+
     score: float
-    hit: bool
+    found: TrueObject | None
+    box_area_px: int
+
+
+class OperatingCurve(NamedTuple):
+    """As the threshold on the score falls past each distinct score: [N] each, from (0, 0, 0) on."""
+
+    recall: Curve
+    precision: Curve
+    false_alarms: Curve
 
 
 @dataclass
 class DetectionScores:
-    """Collects the frames of a run. Boxes are matched greedily, highest score first, each mover once."""
+    """Collects the frames of a run. Boxes are matched greedily, highest score first, each mover once.
+
+    Attributes:
+        frames: that were judged.
+        seconds: from each of them to its next frame, added up.
+        movers: that were to be found.
+    """
 
     frames: int = 0
-    movers: int = 0
-    judged: list[_Judged] = field(default_factory=list)
-    _moving: NDArray[np.int64] = field(default_factory=lambda: np.zeros(PIXEL_BINS, np.int64))
-    _static: NDArray[np.int64] = field(default_factory=lambda: np.zeros(PIXEL_BINS, np.int64))
+    seconds: float = 0.0
+    movers: list[TrueObject] = field(default_factory=list)
+    _judged: list[_Judged] = field(default_factory=list)
 
-    def add_frame(self, boxes: Sequence[ScoredBox], labels: Labels) -> None:
+    def add_frame(self, boxes: Sequence[ScoredBox], labels: Labels, seconds: float) -> None:
         """Match one frame's regions with its movers."""
-        counted = [thing.bbox for thing in labels.objects if thing.counted]
+        counted = [thing for thing in labels.objects if thing.counted]
         ignored = [thing.bbox for thing in labels.objects if not thing.counted]
         self.frames += 1
-        self.movers += len(counted)
+        self.seconds += seconds
+        self.movers += counted
         free = set(range(len(counted)))
         for box in sorted(boxes, key=lambda one: -one.score):
-            overlaps = [(iou(box.bbox, counted[k]), k) for k in sorted(free)]
+            overlaps = [(iou(box.bbox, counted[k].bbox), k) for k in sorted(free)]
             best, index = max(overlaps, default=(0.0, -1))
+            area_px = box.bbox.width * box.bbox.height
             if best >= MIN_IOU:
                 free.discard(index)
-                self.judged.append(_Judged(box.score, hit=True))
+                self._judged.append(_Judged(box.score, counted[index], area_px))
             elif not _is_ignored(box.bbox, ignored):
-                self.judged.append(_Judged(box.score, hit=False))
+                self._judged.append(_Judged(box.score, None, area_px))
 
-    def add_pixels(self, evidence: Float32Array, inside: BoolArray, labels: Labels) -> None:
-        """Count pixels by evidence [H, W] in 0..1; ignored movers and what left the image do not count."""
-        bins = np.clip(evidence * PIXEL_BINS, 0, PIXEL_BINS - 1).astype(np.intp)
-        judged = inside & ~labels.ignored
-        self._moving += np.bincount(bins[judged & labels.moving], minlength=PIXEL_BINS)
-        self._static += np.bincount(bins[judged & ~labels.moving], minlength=PIXEL_BINS)
+    def merge(self, other: DetectionScores) -> None:
+        """Count all of ``other``, too."""
+        self.frames += other.frames
+        self.seconds += other.seconds
+        self.movers += other.movers
+        self._judged += other._judged
 
-    def summary(self) -> dict[str, float | int | None]:
-        """All figures; None where there was nothing to find."""
-        recall, precision, false_alarms = self._curve()
+    def of_size(self, name: str) -> DetectionScores:
+        """The movers of one of ``SIZE_CLASSES``; the others, what found them, and false alarms of another size are
+        left out (as in COCO)."""
+        low, high = SIZE_CLASSES[name]
+        return self._part(lambda thing: low <= thing.box_area_px < high, lambda area_px: low <= area_px < high)
+
+    def of_speed(self, name: str) -> DetectionScores:
+        """The movers of one of ``SPEED_CLASSES``; the others and what found them are left out. A false alarm has no
+        speed: all of them count in every class."""
+        low, high = SPEED_CLASSES[name]
+        return self._part(
+            lambda thing: thing.independent_flow_px is not None and low <= thing.independent_flow_px < high,
+            lambda _: True,
+        )
+
+    def _part(self, kept: Callable[[TrueObject], bool], alarm_counts: Callable[[int], bool]) -> DetectionScores:
+        judged = [
+            one for one in self._judged if (alarm_counts(one.box_area_px) if one.found is None else kept(one.found))
+        ]
+        return DetectionScores(self.frames, self.seconds, [thing for thing in self.movers if kept(thing)], judged)
+
+    def average_precision(self) -> float | None:
+        """None where there was nothing to find."""
+        curve = self.curve()
+        return average_precision(curve.recall, curve.precision) if self.movers else None
+
+    def alarms(self) -> int:
+        """False alarms as a user sees them: regions labelled as motion (their score is at least 0.5)."""
+        return sum(one.found is None and one.score >= MOTION_SCORE for one in self._judged)
+
+    def summary(self) -> dict[str, Any]:
+        """All figures; None where there was nothing to find, or nothing found."""
+        curve = self.curve()
+        any_movers = bool(self.movers)
+        hits = sum(one.found is not None and one.score >= MOTION_SCORE for one in self._judged)
+        alarms = self.alarms()
         return {
             "frames": self.frames,
-            "movers": self.movers,
-            "roi_ap": _rounded(_average_precision(recall, precision) if self.movers else None),
-            "best_f1": _rounded(_best_f1(recall, precision) if self.movers else None),
-            "recall_at_0.1_false_alarms": _rounded(self._recall_at(0.1, recall, false_alarms)),
-            "recall_at_0.01_false_alarms": _rounded(self._recall_at(0.01, recall, false_alarms)),
-            "false_alarms_per_frame": _rounded(self._alarms() / self.frames if self.frames else None),
-            "pixel_ap": _rounded(self._pixel_ap()),
+            "seconds": round(self.seconds, 3),
+            "movers": len(self.movers),
+            "roi_ap": rounded(self.average_precision()),
+            "best_f1": rounded(_best_f1(curve) if any_movers else None),
+            "recall": rounded(hits / len(self.movers) if any_movers else None),
+            "precision": rounded(hits / (hits + alarms) if hits + alarms else None),
+            **{f"recall_at_{rate:g}_false_alarms": rounded(self._recall_at(rate, curve)) for rate in FALSE_ALARM_RATES},
+            "false_alarms_per_frame": rounded(alarms / self.frames if self.frames else None),
+            "false_alarms_per_minute": rounded(60 * alarms / self.seconds if self.seconds else None),
         }
 
-    def _curve(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def curve(self) -> OperatingCurve:
         """Recall, precision and false alarms, as the threshold on the score falls past each distinct score."""
-        judged = sorted(self.judged, key=lambda one: -one.score)
-        hits = np.cumsum([0, *(one.hit for one in judged)])
+        judged = sorted(self._judged, key=lambda one: -one.score)
+        hits = np.cumsum([0, *(one.found is not None for one in judged)])
         scores = np.array([one.score for one in judged])
         ends = np.flatnonzero(np.append(np.diff(scores) != 0, True)) + 1 if judged else np.array([], np.intp)
         ends = np.concatenate([[0], ends])
-        return (
-            hits[ends] / max(self.movers, 1),
+        return OperatingCurve(
+            hits[ends] / max(len(self.movers), 1),
             hits[ends] / np.maximum(ends, 1),
             (ends - hits[ends]).astype(np.float64),
         )
 
-    def _alarms(self) -> int:
-        """False alarms as a user sees them: regions labelled as motion (their score is at least 0.5)."""
-        return sum(not one.hit and one.score >= MOTION_SCORE for one in self.judged)
-
-    def _recall_at(
-        self, per_frame: float, recall: NDArray[np.float64], false_alarms: NDArray[np.float64]
-    ) -> float | None:
+    def _recall_at(self, per_frame: float, curve: OperatingCurve) -> float | None:
         if not self.movers:
             return None
-        return float(recall[false_alarms <= per_frame * self.frames].max(initial=0.0))
-
-    def _pixel_ap(self) -> float | None:
-        moving, static = (np.cumsum(counts[::-1]) for counts in (self._moving, self._static))
-        if not moving[-1]:
-            return None
-        return _average_precision(moving / moving[-1], moving / np.maximum(moving + static, 1))
+        return float(curve.recall[curve.false_alarms <= per_frame * self.frames].max(initial=0.0))
 
 
 def iou(first: BoundingBox, second: BoundingBox) -> float:
@@ -128,16 +185,11 @@ def _is_ignored(box: BoundingBox, ignored: Sequence[BoundingBox]) -> bool:
     return any(_shared_px(box, other) >= IGNORED_SHARE * box.width * box.height for other in ignored)
 
 
-def _average_precision(recall: NDArray[np.float64], precision: NDArray[np.float64]) -> float:
-    """Area under the curve, precision made monotone (as in PASCAL VOC since 2010)."""
-    steps = np.diff(np.concatenate([[0.0], recall]))
-    monotone = np.maximum.accumulate(precision[::-1])[::-1]
-    return float((steps * monotone).sum())
-
-
-def _best_f1(recall: NDArray[np.float64], precision: NDArray[np.float64]) -> float:
+def _best_f1(curve: OperatingCurve) -> float:
+    recall, precision = curve.recall, curve.precision
     return float((2 * recall * precision / np.maximum(recall + precision, 1e-9)).max())
 
 
-def _rounded(value: float | None) -> float | None:
+def rounded(value: float | None) -> float | None:
+    """Four digits; None stays."""
     return None if value is None else round(value, 4)

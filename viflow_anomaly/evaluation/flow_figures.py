@@ -13,7 +13,7 @@ from viflow_anomaly.evaluation.flow_pictures import correspondence_picture, flow
 from viflow_anomaly.evaluation.flow_run import ByMethod, FlowMeasurement, group_of
 from viflow_anomaly.evaluation.flow_truth import FlowTruth, spread
 from viflow_anomaly.evaluation.paper_table import PAPER_TABLE
-from viflow_anomaly.evaluation.plot_style import SavedPicture
+from viflow_anomaly.evaluation.plot_style import SavedPicture, file_name
 from viflow_anomaly.evaluation.plots import FlowPoint, epe_by_hypotheses, epe_by_runtime, hypothesis_wins
 from viflow_anomaly.geometry import Float32Array
 
@@ -53,7 +53,7 @@ def draw_flow_figures(
         pictures += _draw_charts(folder, name, measurement.methods, by_method)
     for name, log in (training_logs or {}).items():
         if log.is_file():
-            pictures.append(hypothesis_wins(log, folder / f"wins-{_file_name(name)}", title=name))
+            pictures.append(hypothesis_wins(log, folder / f"wins-{file_name(name)}", title=name))
     return pictures
 
 
@@ -111,7 +111,7 @@ def _draw_pair(
             continue
     if not valid.any() or not flows:
         return []
-    name = _file_name(group)
+    name = file_name(group)
     pictures = [flow_wheel_picture(pair.source.image, true_px, valid, flows, folder / f"flow-{name}")]
     best = next(iter(flows))
     if (valid & np.isfinite(flows[best]).all(axis=-1)).any():
@@ -125,12 +125,7 @@ def _draw_charts(folder: Path, name: str, methods: Sequence[MethodAbout], by_met
     points = flow_points(methods, by_method)
     pictures = []
     if any(point.runtime_ms for point in points):
-        pictures.append(epe_by_runtime(points, folder / f"epe-runtime-{_file_name(name)}", title=name))
+        pictures.append(epe_by_runtime(points, folder / f"epe-runtime-{file_name(name)}", title=name))
     if len({point.hypotheses for point in points if point.hypotheses is not None}) > 1:
-        pictures.append(epe_by_hypotheses(points, folder / f"epe-hypotheses-{_file_name(name)}", title=name))
+        pictures.append(epe_by_hypotheses(points, folder / f"epe-hypotheses-{file_name(name)}", title=name))
     return pictures
-
-
-def _file_name(text: str) -> str:
-    """What is safe in a file's name on any system."""
-    return "".join(character if character.isalnum() or character in "-_.+" else "_" for character in text)

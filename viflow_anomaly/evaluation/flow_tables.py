@@ -42,7 +42,7 @@ def sequence_table(report: Report) -> Table:
     """Mean EPE of every method (a column) on every sequence (a row)."""
     methods = list(report["methods"])
     rows = tuple(
-        (sequence, *(_number(figures[method]["epe_mean_px"], 3) for method in methods))
+        (sequence, *(number_text(figures[method]["epe_mean_px"], 3) for method in methods))
         for sequence, figures in report["sequences"].items()
     )
     return Table("Mean EPE in px by sequence", ("sequence", *methods), rows, 1)
@@ -57,10 +57,12 @@ def paper_table(report: Report) -> Table:
     rows = []
     for row in report["paper"]["rows"]:
         errors = [
-            _number(row[data][key], 2) for data in ("kitti", "euroc") for key in ("mean_px", "sd_px", "median_px")
+            number_text(row[data][key], 2) for data in ("kitti", "euroc") for key in ("mean_px", "sd_px", "median_px")
         ]
-        quotients = [_number(row[data]["quotient"], 2) for data in ("kitti", "euroc")]
-        rows.append((row["algorithm"], _text(row["hypotheses"]), *errors, _number(row["runtime_ms"], 1), *quotients))
+        quotients = [number_text(row[data]["quotient"], 2) for data in ("kitti", "euroc")]
+        rows.append(
+            (row["algorithm"], _text(row["hypotheses"]), *errors, number_text(row["runtime_ms"], 1), *quotients)
+        )
     return Table(f"As printed in {report['paper']['source']}", heads, tuple(rows), 2)
 
 
@@ -72,7 +74,7 @@ def _scope_table(report: Report, scope: str, figures: dict[str, Any]) -> Table:
     for name, about in report["methods"].items():
         one = figures[name]
         values = [
-            _number(one[key] if one[key] is None or key not in SHARES else 100 * one[key], digits)
+            number_text(one[key] if one[key] is None or key not in SHARES else 100 * one[key], digits)
             for _, key, digits in FIGURES
         ]
         left = [str(sum(one["missing_pairs"].values()))] if missing else []
@@ -106,12 +108,12 @@ def notes(report: Report) -> list[str]:
 def markdown(report: Report) -> str:
     """All tables in Markdown."""
     parts = ["# Flow against ground truth"]
-    parts += [_markdown_table(table) for table in (*report_tables(report), sequence_table(report))]
-    parts += ["\n".join(f"- {line}" for line in notes(report)), _markdown_table(paper_table(report))]
+    parts += [markdown_table(table) for table in (*report_tables(report), sequence_table(report))]
+    parts += ["\n".join(f"- {line}" for line in notes(report)), markdown_table(paper_table(report))]
     return "\n\n".join(parts) + "\n"
 
 
-def _markdown_table(table: Table) -> str:
+def markdown_table(table: Table) -> str:
     rule = ["---" if column < table.text_columns else "---:" for column in range(len(table.heads))]
     lines = [_markdown_row(row) for row in (table.heads, rule, *table.rows)]
     return "\n".join([f"## {_escaped_markdown(table.title)}", "", *lines])
@@ -172,7 +174,7 @@ def _escaped_latex(text: str) -> str:
     return "".join(LATEX_SPECIAL.get(character, character) for character in text.replace("\n", " "))
 
 
-def _number(value: float | None, digits: int) -> str:
+def number_text(value: float | None, digits: int) -> str:
     return NONE if value is None else f"{value:.{digits}f}"
 
 

@@ -103,6 +103,11 @@ def drawing(stem: Path, *, width_in: float = COLUMN_IN, height_in: float = 2.4) 
         _write(figure, saved(stem))
 
 
+def file_name(text: str) -> str:
+    """What is safe in a file's name on any system."""
+    return "".join(character if character.isalnum() or character in "-_.+" else "_" for character in text)
+
+
 def saved(stem: Path) -> SavedPicture:
     """Where ``drawing(stem)`` writes."""
     return SavedPicture(stem.with_name(stem.name + ".png"), stem.with_name(stem.name + ".pdf"))

@@ -1,7 +1,8 @@
 """Classical detectors of independent motion, on the same regions as ours: what else a user could run.
 
 Each gives an evidence map in gray levels, or in pixels of unexplained flow times ``GRAY_PER_PX`` so that the same
-thresholds apply, and where it could be computed. None uses the IMU or a calibration.
+thresholds apply, and where it could be computed. Only ``gyro_difference`` uses the IMU and the calibration; without
+them it has no answer.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from viflow_anomaly.geometry import Float32Array, pixel_grid
-from viflow_anomaly.sensor_data import FramePair, Uint8Array
+from viflow_anomaly.geometry import Float32Array, integrate_gyro, pixel_grid, project_rays, unproject_pixels
+from viflow_anomaly.residual import photometric_residual, reconstruct
+from viflow_anomaly.sensor_data import FramePair, ImuSamples, Uint8Array
 
 BoolArray = NDArray[np.bool_]
 
@@ -22,6 +24,8 @@ GRAY_PER_PX = 8.0
 MAX_CORNERS = 400
 RANSAC_PX = 2.0
 MIN_MATCHES = 8
+MIN_COSINE = 1e-3
+"""A ray that turns further than this beyond the side is behind the camera."""
 
 
 class Evidence(NamedTuple):
@@ -79,8 +83,41 @@ def flow_off_epipolar_lines(pair: FramePair) -> Evidence:
     return Evidence((distance_px * GRAY_PER_PX).astype(np.float32), inside)
 
 
-RIVALS: dict[str, Callable[[FramePair], Evidence]] = {
+def gyro_difference(pair: FramePair) -> Evidence | None:
+    """Difference after the gyro's rotation, K R K^-1 without distortion: what a stabiliser takes out.
+
+    None without a calibration that says how the IMU is mounted.
+    """
+    camera = pair.camera
+    if camera is None or camera.R_cam_imu is None:
+        return None
+    start_ns, end_ns = (
+        stamp + round(camera.time_offset_s * 1e9) for stamp in (pair.source.timestamp_ns, pair.target.timestamp_ns)
+    )
+    R_source_target = integrate_gyro(*_between(pair.imu, start_ns, end_ns))
+    R_target_source = camera.R_cam_imu @ R_source_target.T @ camera.R_cam_imu.T
+    height, width = pair.source.image.shape
+    rays = unproject_pixels(camera, pixel_grid(height, width))
+    turned = np.concatenate([rays, np.ones((height, width, 1))], axis=-1) @ R_target_source.T  # H, W, 3
+    ahead = turned[..., 2:] > MIN_COSINE
+    at_px = project_rays(camera, turned[..., :2] / np.where(ahead, turned[..., 2:], 1.0))
+    coordinates = np.where(ahead, at_px, np.nan).astype(np.float32)
+    reconstruction, inside = reconstruct(pair.target.image, coordinates)
+    return Evidence(photometric_residual(pair.source.image, reconstruction, inside), inside)
+
+
+def _between(imu: ImuSamples, start_ns: int, end_ns: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Stamps [N] and rates [N, 3] of an interval, interpolated at its ends."""
+    inner = (imu.timestamps_ns > start_ns) & (imu.timestamps_ns < end_ns)
+    stamps = np.concatenate([[start_ns], imu.timestamps_ns[inner], [end_ns]]).astype(np.int64)
+    since = imu.timestamps_ns - start_ns  # small numbers: float64 holds them exactly
+    rates = [np.interp(stamps - start_ns, since, imu.gyro_rad_s[:, axis]) for axis in range(3)]
+    return stamps, np.stack(rates, axis=-1)
+
+
+RIVALS: dict[str, Callable[[FramePair], Evidence | None]] = {
     "frame difference": frame_difference,
+    "gyro difference": gyro_difference,
     "homography difference": homography_difference,
     "DIS minus homography": flow_minus_homography,
     "DIS off epipolar lines": flow_off_epipolar_lines,

@@ -3,7 +3,7 @@
 ```
 drive/
   velodyne_points/data/0000000000.bin     float32 x y z reflectance, one scan a frame; some frames may have none
-  label_2/, label_motion_derived.csv      optional; see kitti_boxes.py
+  label_2/, label_motion_derived.csv      optional; see datasets/kitti_labels.py
 ```
 A scan's points are brought into the camera (``T_cam_velo = T_cam_imu inv(T_velo_imu)``) and into its pixels; those that
 nearer ones surround are hidden from the camera, which sits lower and farther ahead than the scanner. Points in boxes of
@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 
 from viflow_anomaly.config import ImageLimits
 from viflow_anomaly.datasets.kitti_files import numbered_files, read_calibration
+from viflow_anomaly.datasets.kitti_labels import LABELLED_CAMERA, Box, label_scale
 from viflow_anomaly.datasets.recording import FileRecording
 from viflow_anomaly.datasets.registry import open_recording
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.geometry import project_rays, rigid_motion_flow
-from viflow_anomaly.ground_truth.kitti_boxes import Box, read_doubtful_boxes
+from viflow_anomaly.ground_truth.kitti_boxes import read_doubtful_boxes
 from viflow_anomaly.ground_truth.range_image import MARGIN_PX, NEAREST_M, ImagePoints, front_depth, points_in_image
 from viflow_anomaly.ground_truth.truth_folder import FrameTruth, TruthFolder, record_head, require_camera
 from viflow_anomaly.sensor_data import Float64Array, PinholeCamera
@@ -33,8 +34,6 @@ from viflow_anomaly.sensor_data import Float64Array, PinholeCamera
 Float32Array = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 
-LABELLED_CAMERA = "image_02"
-OFFICIAL_SIZE = (1242.0, 375.0)
 MAX_SCAN_BYTES = 64 * 1024 * 1024
 REACH_RAD = 0.013
 """Half as much again as the angle between two of the HDL-64's beams (0.0087 at its widest)."""
@@ -97,7 +96,7 @@ def render_lidar(
     boxes = read_doubtful_boxes(recording.root) if labelled else {}
     record = {**record_head(recording.name, lens), "made_from": {"scans": "velodyne_points", "labels": bool(boxes)}}
     folder = TruthFolder(out or recording.root, record, poses, overwrite=overwrite)
-    scale = _label_scale(recording, lens)
+    scale = label_scale(recording.root, lens.width, lens.height)
     counts = np.zeros(3, dtype=np.int64)
     kept = with_flow = without_labels = 0
     for done, (index, number, scan) in enumerate(scans, start=1):
@@ -168,14 +167,6 @@ def _scanner_mounting(recording: FileRecording, camera: PinholeCamera) -> Float6
     T_velo_imu = np.eye(4)
     T_velo_imu[:3, :3], T_velo_imu[:3, 3] = values["R"].reshape(3, 3), values["T"]
     return np.asarray(camera.T_cam_imu @ np.linalg.inv(T_velo_imu))
-
-
-def _label_scale(recording: FileRecording, camera: PinholeCamera) -> tuple[float, float]:
-    """Pixels here for a pixel of the labels: images may be stored smaller than they were labelled."""
-    path = recording.root.resolve().parent / "calib_cam_to_cam.txt"
-    values = read_calibration(path, {"S_rect_02": 2})
-    width, height = values.get("S_rect_02", np.array(OFFICIAL_SIZE))
-    return camera.width / float(width), camera.height / float(height)
 
 
 def read_scan(path: Path) -> Float32Array:
