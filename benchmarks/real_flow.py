@@ -19,7 +19,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from machine import circumstances
 from reproduction import BASELINES, call, command, rows
 
 from viflow_anomaly.checkpoint_record import write_atomically
@@ -28,6 +27,7 @@ from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.datasets.registry import open_recording
 from viflow_anomaly.errors import ViflowError
 from viflow_anomaly.evaluation.flow_methods import network_methods
+from viflow_anomaly.evaluation.flow_report import circumstances
 from viflow_anomaly.evaluation.flow_truth import PairName
 from viflow_anomaly.geometry import pixel_grid
 from viflow_anomaly.residual import photometric_residual, reconstruct

@@ -22,12 +22,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from machine import circumstances
 
 from viflow_anomaly.checkpoint_record import read_checkpoint, write_atomically
 from viflow_anomaly.config import ModelConfig
 from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.datasets.registry import open_recording
+from viflow_anomaly.evaluation.flow_report import circumstances
 from viflow_anomaly.evaluation.plots import clustering_error_histogram
 from viflow_anomaly.motor_input import clustering_error_m
 
@@ -86,9 +86,10 @@ def call(arguments: list[str], log: Path | None = None) -> None:
 def trained(data: Path, recordings: Path, folder: Path, *, steps: int, settings: dict[str, object]) -> Path:
     """The checkpoint of one training, exported; trained now where it is not there."""
     checkpoint = folder / "model.safetensors"
-    if not checkpoint.exists():
-        fixed = {"model.preset": "compact", **settings}
-        assignments = [part for key, value in fixed.items() for part in ("--set", f"{key}={value}")]
+    if checkpoint.exists():
+        _require_same(checkpoint, {"training.steps": steps, **settings})
+    else:
+        assignments = [part for key, value in settings.items() for part in ("--set", f"{key}={value}")]
         sequences = sorted(recordings.parent.glob(recordings.name))
         if not sequences:
             raise SystemExit(f"expected recordings {recordings}, found none: make reproduction simulates them")
@@ -99,11 +100,24 @@ def trained(data: Path, recordings: Path, folder: Path, *, steps: int, settings:
     return checkpoint
 
 
+def _require_same(checkpoint: Path, wanted: dict[str, object]) -> None:
+    """An older training under the same name is not taken for the one that was asked for."""
+    record = read_checkpoint(checkpoint)[1]
+    found = {"model": record.model.model_dump(mode="json"), "training": record.provenance["training"]}
+    for key, value in wanted.items():
+        there: Any = found
+        for step in key.split("."):
+            there = there.get(step) if isinstance(there, dict) else None
+        if there != value:
+            raise SystemExit(f"{checkpoint}: expected a training with {key} {value}, found {there}; move it away")
+
+
 def train_rows(data: Path, rigs: Sequence[str], *, steps: int, jobs: int) -> None:
     """Train what is missing, ``jobs`` at a time on one thread each."""
 
     def one(row: Row) -> None:
         settings: dict[str, object] = {
+            "model.preset": "compact",
             "model.motion_inputs": row.inputs,
             "model.hypotheses": row.hypotheses,
             "training.look_aheads": list(LOOK_AHEADS[row.rig]),
@@ -168,7 +182,8 @@ def measure_splits(data: Path, out: Path, *, steps: int, jobs: int) -> dict[str,
     look_aheads = ",".join(map(str, LOOK_AHEADS[SPLIT_RIG]))
 
     def one(rule: str) -> tuple[str, dict[str, float]]:
-        settings = {
+        settings: dict[str, object] = {
+            "model.preset": "compact",
             "model.hypotheses": 8,
             "training.look_aheads": list(LOOK_AHEADS[SPLIT_RIG]),
             "training.split.rule": rule,

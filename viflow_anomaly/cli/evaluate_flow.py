@@ -115,7 +115,7 @@ def flow(
     cv2.setNumThreads(settings.threads)
     named = _checkpoints(checkpoint, settings)
     whole = _truths(recordings, _numbers(look_aheads), ground_truth, movers)
-    truths: Sequence[FlowTruth] = _test_parts(whole, settings) if test_part else whole
+    truths: Sequence[FlowTruth] = _test_parts(whole, named, settings) if test_part else whole
     baselines, left_out = _baselines(methods)
     networks = _networks(named, settings)
     chosen = [*baselines, *_result_files(results or [], truths, max_pairs), *networks]
@@ -133,14 +133,15 @@ def flow(
     options: dict[str, Any] = {"look_aheads": _numbers(look_aheads), "max_pairs": max_pairs, "crop_px": crop}
     options |= {
         "movers": movers,
+        "test_part": settings.training.split.model_dump(mode="json") if test_part else None,
         "repeats": repeats,
         "correction": settings.detector.correction.model_dump(mode="json"),
     }
     report = flow_report(measurement, threads=settings.threads, left_out=left_out, options=options)
     _write(report, out, markdown, latex)
+    print(_json(report)) if as_json else _print(report)
     if plots is not None:
         _draw(plots, measurement, chosen, truths, max_pairs, {name: path for name, path in named if path is not None})
-    print(_json(report)) if as_json else _print(report)
 
 
 def _numbers(text: str) -> list[int]:
@@ -195,10 +196,24 @@ def _truths(
             truths += open_scene_flow(path, movers=movers)
         else:
             truths.append(RecordingTruth(path, look_aheads, ground_truth=ground_truth, movers=movers))
+    names = [truth.sequence for truth in truths]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ConfigError(
+            f"recordings: expected folders of different names, by which they are told apart, found {twice[0]!r} twice",
+            code="sequence_names",
+            field="recordings",
+        )
     return truths
 
 
-def _test_parts(truths: Sequence[RecordingTruth | SceneFlowTruth], settings: Settings) -> Sequence[FlowTruth]:
+def _test_parts(
+    truths: Sequence[RecordingTruth | SceneFlowTruth],
+    named: Sequence[tuple[str | None, Path | None]],
+    settings: Settings,
+) -> Sequence[FlowTruth]:
+    """What the split keeps for the test; every checkpoint must have been trained with that very split."""
+    from viflow_anomaly.checkpoint_record import bundled_checkpoint, read_checkpoint
     from viflow_anomaly.errors import ConfigError
     from viflow_anomaly.evaluation.flow_truth import RecordingTruth, TestPart
 
@@ -209,6 +224,16 @@ def _test_parts(truths: Sequence[RecordingTruth | SceneFlowTruth], settings: Set
             code="split_rule_unknown",
             field="training.split.rule",
         )
+    for _, path in named:
+        checkpoint = path or bundled_checkpoint()
+        trained = read_checkpoint(checkpoint)[1].provenance.get("training", {}).get("split")
+        if trained != split.model_dump(mode="json"):
+            raise ConfigError(
+                f"--test-part: expected the split that {checkpoint} was trained with, {trained}, "
+                f"found {split.model_dump(mode='json')}",
+                code="split_differs",
+                field="training.split",
+            )
     return [TestPart(truth, split) if isinstance(truth, RecordingTruth) else truth for truth in truths]
 
 

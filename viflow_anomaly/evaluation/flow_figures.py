@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from viflow_anomaly.errors import DatasetError, InvalidInputError
 from viflow_anomaly.evaluation.flow_methods import FlowMethod, MethodAbout, NoEstimateError
 from viflow_anomaly.evaluation.flow_pictures import correspondence_picture, flow_wheel_picture
 from viflow_anomaly.evaluation.flow_run import ByMethod, FlowMeasurement, group_of
@@ -47,8 +48,9 @@ def draw_flow_figures(
     """
     pictures = []
     groups = measurement.groups()
-    for group, (truth, index) in _middle_pairs(spread(truths, max_pairs)).items():
-        pictures += _draw_pair(folder, group, _best_methods(methods, groups[group]), truth, index)
+    for group, candidates in _from_the_middle(spread(truths, max_pairs)).items():
+        best = _best_methods(methods, groups[group])
+        pictures += next(filter(None, (_draw_pair(folder, group, best, *one) for one in candidates)), [])
     for name, by_method in (groups if len(groups) == 1 else {**groups, "all": measurement.total()}).items():
         pictures += _draw_charts(folder, name, measurement.methods, by_method)
     for name, log in (training_logs or {}).items():
@@ -91,23 +93,30 @@ def _best_methods(methods: Sequence[FlowMethod], by_method: ByMethod) -> list[Fl
     return (networks + [method for method in ranked if method.about.kind != "network"])[:MAX_PANELS]
 
 
-def _middle_pairs(chosen: Sequence[tuple[FlowTruth, int]]) -> dict[str, tuple[FlowTruth, int]]:
+def _from_the_middle(chosen: Sequence[tuple[FlowTruth, int]]) -> dict[str, list[tuple[FlowTruth, int]]]:
+    """The pairs of each group, the one in the middle first: it may be one that cannot be measured."""
     groups: dict[str, list[tuple[FlowTruth, int]]] = {}
     for truth, index in chosen:
         groups.setdefault(group_of(truth.sequence), []).append((truth, index))
-    return {group: some[len(some) // 2] for group, some in sorted(groups.items())}
+    return {
+        group: [some[k] for k in sorted(range(len(some)), key=lambda k: abs(k - len(some) // 2))]
+        for group, some in sorted(groups.items())
+    }
 
 
 def _draw_pair(
     folder: Path, group: str, methods: Sequence[FlowMethod], truth: FlowTruth, index: int
 ) -> list[SavedPicture]:
-    true_px, valid = truth.truth(index)
-    pair = truth.pair(index)
+    try:
+        true_px, valid = truth.truth(index)
+        pair = truth.pair(index)
+    except (DatasetError, InvalidInputError):
+        return []
     flows: dict[str, Float32Array] = {}
     for method in methods:
         try:
             flows[method.about.name] = method.flow(truth.pair(index, method.motor_source), truth.name(index))
-        except NoEstimateError:
+        except (NoEstimateError, DatasetError, InvalidInputError):
             continue
     if not valid.any() or not flows:
         return []
