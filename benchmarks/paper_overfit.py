@@ -68,7 +68,8 @@ def overfit(batch: Batch, config: ModelConfig, *, steps: int, learning_rate: flo
         )
         errors.append(float(result.loss.detach()) / pixels)
         if step % REPORT_EVERY == 0:
-            print(f"step {step}: {errors[-1] / errors[0]:.3f} of the first error, {time.process_time() - started:.0f} s of CPU")
+            spent_s = time.process_time() - started
+            print(f"step {step}: {errors[-1] / errors[0]:.3f} of the first error, {spent_s:.0f} s of CPU")
         if errors[-1] <= goal * errors[0] or step == steps:
             break
         optimizer.zero_grad(set_to_none=True)

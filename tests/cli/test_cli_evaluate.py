@@ -15,10 +15,12 @@ from simulated_truth import add_ground_truth, add_movers
 from worlds import make_world, write_euroc, write_lines
 
 from viflow_anomaly.checkpoint import load_checkpoint, save_checkpoint
-from viflow_anomaly.config import ModelConfig
+from viflow_anomaly.config import ModelConfig, SplitConfig
 from viflow_anomaly.datasets.registry import open_recording
+from viflow_anomaly.datasets.splits import split_pairs
 from viflow_anomaly.evaluation.flo_files import write_flo
 from viflow_anomaly.evaluation.flow_report import cpu_model
+from viflow_anomaly.evaluation.flow_truth import RecordingTruth, TestPart
 from viflow_anomaly.model.builder import build_model
 
 
@@ -168,6 +170,35 @@ def test_pictures(ask: Ask, recordings: list[Path], checkpoint: Path, tmp_path: 
     assert names == {
         f"{kind}-car.{end}" for kind in ("flow", "correspondences", "epe-runtime") for end in ("png", "pdf")
     }
+
+
+def test_only_what_a_training_never_saw(ask: Ask, tmp_path: Path) -> None:
+    folder = add_ground_truth(tmp_path / "drone_1", make_world(frames=12))
+    split = SplitConfig(rule="blocks", block_s=0.1, seed=2)
+    whole = RecordingTruth(folder)
+    expected = [whole.name(k) for k in split_pairs(whole.pairs, "blocks", seed=2, block_s=0.1).test]
+    part = TestPart(whole, split)
+    assert [part.name(k) for k in range(len(part))] == expected
+    assert 0 < len(expected) < 11
+    model = ModelConfig(preset="compact", hypotheses=1)
+    provenance = {"training": {"split": split.model_dump(mode="json")}}
+    path = tmp_path / "trained.safetensors"
+    save_checkpoint(path, build_model(model), model, name="trained", version="1", provenance=provenance)
+    flow_of_it = flow([folder], path, "--methods", "none", "--test-part", "--json")
+    settings = [part for key in ("rule=blocks", "block_s=0.1") for part in ("--set", f"training.split.{key}")]
+    answer = ask([*flow_of_it, *settings, "--set", "training.split.seed=2"])
+    report = json.loads(answer.out)
+    assert report["all"]["trained"]["pairs"] == len(expected)
+    assert report["options"]["test_part"]["seed"] == 2
+    assert "split_differs" in ask([*flow_of_it, *settings]).err
+    assert "split_rule_unknown" in ask([*flow_of_it]).err
+
+
+def test_recordings_are_told_apart_by_their_names(ask: Ask, checkpoint: Path, tmp_path: Path) -> None:
+    folders = [add_ground_truth(tmp_path / name / "drone_1", make_world(frames=2)) for name in "ab"]
+    answer = ask(flow(folders, checkpoint))
+    assert answer.code == 2
+    assert "sequence_names" in answer.err
 
 
 def test_refusals(ask: Ask, recordings: list[Path], checkpoint: Path, tmp_path: Path) -> None:
