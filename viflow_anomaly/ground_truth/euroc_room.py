@@ -21,7 +21,7 @@ from viflow_anomaly.datasets.recording import FileRecording
 from viflow_anomaly.datasets.registry import open_recording
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.geometry import occluded_pixels, rigid_motion_flow
-from viflow_anomaly.ground_truth.frame_poses import poses_of_frames, read_trajectory_file
+from viflow_anomaly.ground_truth.frame_poses import POSE_RULE, poses_of_frames, read_trajectory_file
 from viflow_anomaly.ground_truth.ply import read_ply_points
 from viflow_anomaly.ground_truth.point_cloud import PointCloud, make_point_cloud
 from viflow_anomaly.ground_truth.range_image import render_depth
@@ -104,8 +104,9 @@ def _poses(recording: FileRecording, trajectory: Path | None, stamps: list[int])
     poses = poses_of_frames(source, stamps)
     if not poses:
         raise DatasetError(
-            f"{source.origin}: expected poses within 1 ms of the frames from {stamps[0]} to {stamps[-1]}, found poses "
-            f"from {source.timestamps_ns[0]} to {source.timestamps_ns[-1]} and none so close",
+            f"{source.origin}: expected poses for the frames from {stamps[0]} to {stamps[-1]} ({POSE_RULE}), found "
+            f"poses from {source.timestamps_ns[0]} to {source.timestamps_ns[-1]}, in the camera's clock, and none so "
+            "close",
             code="trajectory_not_covering",
         )
     return poses
