@@ -33,7 +33,7 @@ import yaml
 
 from viflow_anomaly.config import ImageLimits
 from viflow_anomaly.datasets.motor_table import read_motor
-from viflow_anomaly.datasets.recording import FileRecording
+from viflow_anomaly.datasets.recording import FileRecording, choose_camera
 from viflow_anomaly.datasets.tables import csv_malformed, read_frame_list, read_lines, read_stamped_numbers, read_text
 from viflow_anomaly.datasets.trajectory import Trajectory, rigid, rotations_of
 from viflow_anomaly.errors import DatasetError, InvalidInputError
@@ -77,11 +77,7 @@ def open_euroc(root: Path, *, camera: str | None, limits: ImageLimits) -> FileRe
             ``yaml_malformed``, ``calibration_malformed``, ``motor_not_covering``; the trajectory is read when
             it is asked for.
     """
-    chosen = camera or _cameras(root)[0]
-    if chosen not in _cameras(root):
-        raise DatasetError(
-            f"{root}: expected one of {', '.join(_cameras(root))}, found camera {chosen!r}", code="camera_unknown"
-        )
+    chosen = choose_camera(root, _cameras(root), camera)
     folder = root / chosen
     frames = read_frame_list(folder / "data.csv", ("timestamp", "filename"), folder / "data", header="comment")
     imu_stamps, values = read_stamped_numbers(root / "imu0" / "data.csv", IMU_COLUMNS, header="comment")
@@ -93,6 +89,7 @@ def open_euroc(root: Path, *, camera: str | None, limits: ImageLimits) -> FileRe
         root=root,
         format="euroc",
         camera=calibration,
+        camera_name=chosen,
         imu=ImuLog(imu_stamps, values[:, :3], values[:, 3:]),
         frame_timestamps_ns=frames.timestamps_ns,
         frame_paths=tuple(frames.paths),
