@@ -80,7 +80,7 @@ def render_room(
     points = read_ply_points(cloud_file)
     T_world_cloud = euroc.read_cloud_pose(cloud_file.with_name("sensor.yaml"))
     record = {
-        **record_head(recording.name, lens),
+        **record_head(recording, lens),
         "made_from": {
             "cloud": {**fingerprint(cloud_file), "points": len(points), "T_world_cloud": T_world_cloud.tolist()},
             "trajectory": "the recording's" if trajectory is None else fingerprint(trajectory),
@@ -94,7 +94,7 @@ def render_room(
 def _poses(recording: FileRecording, trajectory: Path | None, stamps: list[int]) -> dict[int, Float64Array]:
     source = recording.trajectory
     if trajectory is not None:
-        source = read_trajectory_file(trajectory, recording.frame_path(0).parent.parent / "sensor.yaml")
+        source = read_trajectory_file(trajectory, recording.root / str(recording.camera_name) / "sensor.yaml")
     if source is None:
         raise DatasetError(
             f"{recording.root}: expected state_groundtruth_estimate0/data.csv or a file of poses (--trajectory), "
@@ -145,13 +145,13 @@ def _render_frames(
     for done, (source, target) in enumerate(itertools.pairwise([*stamps, None]), start=1):
         assert source is not None
         if source in renderer.poses:
-            with_flow += target in renderer.poses
-            if folder.has(source):
+            if folder.has(source, flow=target in renderer.poses):
                 kept += 1
             else:
                 truth = renderer.truth(source, target)
                 folder.write(source, truth)
                 shares.append(float(np.isfinite(truth.depth_m).mean()))
+            with_flow += folder.has_flow(source)
         if on_progress is not None:
             on_progress(done, len(stamps))
     return RoomSummary(

@@ -34,6 +34,7 @@ MOTION_COLUMNS = (
     "moving",
 )
 RESTING = "0"
+MOTION_NAME = "label_motion_derived.csv"
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def read_doubtful_boxes(drive: Path) -> dict[int, list[Box]]:
     Raises:
         DatasetError: ``labels_malformed``, ``csv_malformed``, ``file_name_malformed``, ``text_not_utf8``.
     """
-    motion_file = drive / "label_motion_derived.csv"
+    motion_file = drive / MOTION_NAME
     resting: dict[int, set[Box]] = {}
     doubtful: dict[int, list[Box]] = {}
     if motion_file.is_file():
@@ -65,11 +66,24 @@ def read_doubtful_boxes(drive: Path) -> dict[int, list[Box]]:
                 resting[number].add(box)
             else:
                 boxes.append(box)
-    folder = drive / "label_2"
-    for number, path in (numbered_files(folder, (".txt",)) if folder.is_dir() else {}).items():
+    for number, path in _label_files(drive).items():
         boxes = [box for box in _labels(path) if box not in resting.get(number, ())]
         doubtful[number] = [*doubtful.get(number, []), *boxes]
     return doubtful
+
+
+def label_files(drive: Path) -> list[Path]:
+    """All files that ``read_doubtful_boxes`` reads.
+
+    Raises:
+        DatasetError: ``file_name_malformed``.
+    """
+    return [path for path in (drive / MOTION_NAME, *_label_files(drive).values()) if path.is_file()]
+
+
+def _label_files(drive: Path) -> dict[int, Path]:
+    folder = drive / "label_2"
+    return numbered_files(folder, (".txt",)) if folder.is_dir() else {}
 
 
 def _motions(path: Path) -> Iterator[tuple[int, Box, str]]:
