@@ -108,7 +108,10 @@ HUGE = (400_000, 400_000, 2)
 
 
 def npy_head(version: tuple[int, int], shape: tuple[int, ...]) -> bytes:
-    text = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return npy_header(version, f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n".encode())
+
+
+def npy_header(version: tuple[int, int], text: bytes) -> bytes:
     length = struct.pack("<H" if version == (1, 0) else "<I", len(text))
     return b"\x93NUMPY" + bytes(version) + length + text
 
@@ -122,6 +125,13 @@ def test_a_header_is_compared_before_what_it_promises_is_read(tmp_path: Path, ve
     path.write_bytes(npy_head(version, FLOW.shape) + FLOW.tobytes())
     np.testing.assert_array_equal(ResultFiles("other", tmp_path, [NEXT]).flow(PAIR, NEXT), FLOW)
     path.write_bytes(npy_head(version, FLOW.shape) + FLOW.tobytes()[:-1])
+    assert refusal(tmp_path).code == "results_malformed"
+
+
+@pytest.mark.parametrize("text", [b"(", b"-" * 9000 + b"1", b"{[]: 1}", b"  1\n 2\n", b"[", b"1 +", b"\xff", b""])
+def test_a_header_that_is_none(tmp_path: Path, text: bytes) -> None:
+    (tmp_path / "drone_1").mkdir()
+    (tmp_path / "drone_1/100.npy").write_bytes(npy_header((1, 0), text))
     assert refusal(tmp_path).code == "results_malformed"
 
 

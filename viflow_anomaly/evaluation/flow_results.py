@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 
@@ -27,6 +28,8 @@ from viflow_anomaly.sensor_data import FramePair
 SUFFIXES = (".flo", ".png", ".npy")
 NO_FILE = "no_file"
 NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+# NumPy reads a header as Python source: whatever that can fail with.
+NPY_FAULTS = (OSError, ValueError, TypeError, EOFError, SyntaxError, TokenError, MemoryError, RecursionError)
 
 
 class ResultFiles:
@@ -118,7 +121,7 @@ def _read_npy(path: Path, shape: tuple[int, int, int]) -> Float32Array:
             _require_shape(path, found, shape)
             file.seek(0)
             array = np.lib.format.read_array(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as err:
+    except NPY_FAULTS as err:
         raise _malformed(path, "an array of floats in NumPy's format", str(err)) from err
     return np.asarray(array, dtype=np.float32)
 
