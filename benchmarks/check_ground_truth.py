@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from dataclasses import asdict
 from pathlib import Path
 
@@ -34,8 +35,12 @@ def main() -> None:
         for index in np.flatnonzero(known).tolist()
         if (truth.folder / "static_flow" / f"{recording.frame_timestamps_ns[index]}.png").is_file()
     ]
+    if not stored:
+        sys.exit(f"{truth.folder}: expected stored flow of frames of {arguments.recording}, found none")
     chosen = np.unique(np.linspace(0, len(stored) - 1, min(arguments.pairs, len(stored))).round().astype(int))
     checks = [check for k in chosen if (check := check_pair(recording, truth, stored[k])) is not None]
+    if not checks:
+        sys.exit(f"{truth.folder}: expected flow at pixels with texture, found none in {len(chosen)} pairs")
     medians = {
         name: round(float(np.median([asdict(check)[name] for check in checks])), 3)
         for name in ("flow_px", "distance_px", "identity_gray", "warped_gray")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from worlds import make_world, write_euroc, write_lines
 
-from viflow_anomaly.datasets.euroc import read_T_body_cam
+from viflow_anomaly.datasets.euroc import read_camera_on_body
 from viflow_anomaly.geometry import pixel_grid, so3_exp, unproject_pixels
 from viflow_anomaly.ground_truth.frame_poses import quaternion_of
 from viflow_anomaly.sensor_data import PinholeCamera
@@ -117,11 +117,11 @@ def write_room_recording(
 
 def write_states(mav0: Path, poses: list[Float64Array], stamps: list[int]) -> None:
     """``state_groundtruth_estimate0/data.csv`` of camera poses."""
-    T_body_cam = read_T_body_cam(mav0 / "cam0" / "sensor.yaml")
-    assert T_body_cam is not None
+    mounting = read_camera_on_body(mav0 / "cam0" / "sensor.yaml")
+    assert mounting is not None
     lines = ["#timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z"]
     for stamp, T_world_cam in zip(stamps, poses, strict=True):
-        body = T_world_cam @ np.linalg.inv(T_body_cam)
+        body = T_world_cam @ np.linalg.inv(mounting.T_body_cam)
         numbers = [*body[:3, 3], *quaternion_of(body[:3, :3])]
         lines.append(",".join([str(stamp), *(repr(float(number)) for number in numbers)]))
     write_lines(mav0 / "state_groundtruth_estimate0" / "data.csv", lines)

@@ -170,11 +170,18 @@ def test_imu_without_T_BS(tmp_path: Path) -> None:
     expect(folder, "calibration_malformed", "imu0/sensor.yaml")
 
 
-def test_a_mirrored_T_BS_is_refused(tmp_path: Path) -> None:
-    mirrored = "T_BS: {data: [-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}"
+@pytest.mark.parametrize(
+    ("data", "problem"),
+    [
+        ("-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1", "no rotation"),
+        ("1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0.1, 1", "last row 0 0 0 1, found [0.0, 0.0, 0.1, 1.0]"),
+        ("1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 2", "last row 0 0 0 1"),
+    ],
+)
+def test_a_T_BS_that_is_not_rigid_is_refused(data: str, problem: str, tmp_path: Path) -> None:
     folder = write_euroc(tmp_path)
-    write_lines(folder / "mav0" / "imu0" / "sensor.yaml", [mirrored])
-    assert "T_cam_imu" in expect(folder, "calibration_malformed")
+    write_lines(folder / "mav0" / "imu0" / "sensor.yaml", [f"T_BS: {{data: [{data}]}}"])
+    assert problem in expect(folder, "calibration_malformed", "imu0/sensor.yaml")
 
 
 @pytest.mark.parametrize("text", ["a: [1, 2", "a: b: c", "\tx", "d: 2001-99-99", "- 1", "", "[" * 5000])

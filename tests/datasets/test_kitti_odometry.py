@@ -113,6 +113,15 @@ def test_frames_out_of_order(tmp_path: Path) -> None:
     expect(sequence, "timestamps_not_increasing", "times.txt, line 3: ")
 
 
+@pytest.mark.parametrize("imu", ["plain", "perframe"])
+def test_a_repeated_stamp_of_a_frame_without_image(imu: str, tmp_path: Path) -> None:
+    """The poses belong to all frames, so that the trajectory would need it."""
+    sequence = write_kitti_odometry(tmp_path, imu=imu, times="times")
+    edit(sequence / "times.txt", 3, (sequence / "times.txt").read_text().splitlines()[1])
+    (sequence / "image_0" / "000002.png").unlink()
+    expect(sequence, "timestamps_not_increasing", "times.txt, line 3: ")
+
+
 def test_more_images_than_stamps(tmp_path: Path) -> None:
     sequence = write_kitti_odometry(tmp_path, imu="plain", times="times")
     edit(sequence / "times.txt", 6, None)

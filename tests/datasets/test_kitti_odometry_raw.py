@@ -188,6 +188,8 @@ def test_frames_of_one_time(sequence: Path, tmp_path: Path) -> None:
         lines[number - 1] = lines[number - 2]
         write_lines(path, lines)
     expect(sequence, "timestamps_not_increasing", "times.txt, line 3: ")
+    (sequence / "image_0" / "000002.png").unlink()
+    expect(sequence, "timestamps_not_increasing", "times.txt, line 3: ")
 
 
 def test_an_imu_of_another_time(sequence: Path, tmp_path: Path) -> None:

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from worlds import REAL_DATA, car_world, write_kitti_odometry, write_kitti_raw, write_lines
 
-from viflow_anomaly.datasets.kitti_files import parse_oxts
+from viflow_anomaly.datasets.kitti_files import oxts_places, parse_oxts
 from viflow_anomaly.datasets.kitti_poses import find_poses, oxts_poses, oxts_trajectory, read_poses
+from viflow_anomaly.datasets.kitti_sequence import dataset_of
 from viflow_anomaly.datasets.registry import open_recording
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.geometry import so3_log
@@ -90,7 +91,7 @@ def test_no_trajectory_without_mounting(tmp_path: Path) -> None:
 def test_duplicate_and_disordered_records_are_no_poses() -> None:
     rows = [parse_oxts(Path("x"), 1, row((49.0, 8.4 + k, 0.0, 0.0, 0.0, 0.0))) for k in range(5)]
     stamps = np.array([10, 20, 20, 15, 30], dtype=np.int64)
-    trajectory = oxts_trajectory(stamps, rows, np.eye(4), "oxts")
+    trajectory = oxts_trajectory(stamps, oxts_places(rows), np.eye(4), "oxts")
     assert trajectory is not None
     assert trajectory.timestamps_ns.tolist() == [10, 20, 30]
     degrees = trajectory.T_world_cam[:, 0, 3] / (METRES_PER_DEGREE * np.cos(np.radians(49.0)))
@@ -162,6 +163,12 @@ def test_which_file_belongs_to_a_sequence(tmp_path: Path) -> None:
     assert find_poses(folder) == poses / "01.txt"
 
 
+def test_a_sequence_at_the_root_of_a_file_system() -> None:
+    assert dataset_of(Path("/data/sequences/00")) == Path("/data").resolve()
+    assert dataset_of(Path("/00")) == dataset_of(Path("/sequences/00")) == Path("/").resolve()
+    assert find_poses(Path("/00")) is None
+
+
 @pytest.mark.parametrize(
     ("line", "problem"),
     [
@@ -214,7 +221,7 @@ def test_odometry_poses_agree_with_oxts(sequence: str, first: int) -> None:
     file = next(iter(folder.glob("oxts_first*.txt")))
     rows = [parse_oxts(file, k, line) for k, line in enumerate(file.read_text().splitlines(), start=1)]
     stamps = recording.frame_timestamps_ns
-    by_oxts = oxts_trajectory(stamps, rows, recording.camera.T_cam_imu, str(file))
+    by_oxts = oxts_trajectory(stamps, oxts_places(rows), recording.camera.T_cam_imu, str(file))
     assert by_oxts is not None
     for source_ns, target_ns in zip(stamps[first:-5].tolist(), stamps[first + 5 :].tolist(), strict=True):
         true, found = (one.displacement_m(source_ns, target_ns) for one in (recording.trajectory, by_oxts))

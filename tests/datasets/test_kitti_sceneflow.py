@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ import pytest
 from kitti_worlds import FRAME_NS, START_NS, frame_stamps, imu_stamps, write_raw_drive, write_sceneflow
 from worlds import textured_image, write_lines
 
+from viflow_anomaly.datasets import kitti_drives, kitti_files
 from viflow_anomaly.datasets.kitti_sceneflow import PAPER_WINDOW, KittiSceneFlow
 from viflow_anomaly.errors import DatasetError, InvalidInputError
 from viflow_anomaly.motion_input import build_motion_window
@@ -114,9 +116,32 @@ def test_moving_objects(root: Path) -> None:
 @pytest.mark.parametrize(("image", "dtype"), [((64, 96, 3), np.uint8), ((64, 96), np.uint16)])
 def test_a_map_of_objects_in_another_format(image: tuple[int, ...], dtype: type, root: Path) -> None:
     assert cv2.imwrite(str(root / "training/obj_map/000000_10.png"), np.zeros(image, dtype))
-    with pytest.raises(DatasetError, match="8-bit gray") as caught:
+    with pytest.raises(DatasetError, match=r"1 channel\(s\) of uint8") as caught:
         KittiSceneFlow(root).moving(0)
     assert caught.value.code == "ground_truth_malformed"
+
+
+def test_a_drives_lists_are_read_once(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    listed: list[str] = []
+    for name in ("numbered_files", "read_stamps"):
+        for module in (kitti_files, kitti_drives):
+            if hasattr(module, name):
+                monkeypatch.setattr(module, name, counted(getattr(module, name), listed))
+    assert len(KittiSceneFlow(root)) == 2
+    extract, sync = (f"{DRIVE}_{kind}" for kind in ("extract", "sync"))
+    assert sorted(listed) == [
+        f"{extract}/oxts/data",
+        f"{extract}/oxts/timestamps.txt",
+        f"{sync}/image_02/timestamps.txt",
+    ]
+
+
+def counted(read: Callable[..., object], paths: list[str]) -> Callable[..., object]:
+    def reading(path: Path, *arguments: object) -> object:
+        paths.append("/".join(path.parts[-3:]))
+        return read(path, *arguments)
+
+    return reading
 
 
 def test_reasons_are_counted(tmp_path: Path) -> None:

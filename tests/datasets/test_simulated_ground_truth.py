@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from viflow_anomaly.config import ImageLimits
+from viflow_anomaly.datasets import ground_truth_png
 from viflow_anomaly.datasets.ground_truth_png import (
     read_depth_png,
     read_flow_png,
@@ -17,7 +20,12 @@ from viflow_anomaly.datasets.ground_truth_png import (
     write_instances_png,
     write_mask_png,
 )
-from viflow_anomaly.datasets.simulated_ground_truth import OBJECT_COLUMNS, MovingObject, SimulatedGroundTruth
+from viflow_anomaly.datasets.simulated_ground_truth import (
+    OBJECT_COLUMNS,
+    MovingObject,
+    SimulatedGroundTruth,
+    ground_truth_folder,
+)
 from viflow_anomaly.errors import DatasetError
 
 STAMPS = (1_000_000_000, 1_050_000_000, 1_100_000_000)
@@ -119,6 +127,37 @@ def test_malformed_pngs_are_named(tmp_path: Path, content: bytes, read: object) 
     assert raised.value.code == "ground_truth_malformed"
 
 
+def test_a_png_that_ends_early_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "flow.png"
+    noise = np.random.default_rng(0).uniform(-9, 9, (64, 64, 2)).astype(np.float32)
+    write_flow_png(path, noise, np.ones((64, 64), bool))
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(DatasetError, match="last chunk") as raised:
+        read_flow_png(path)
+    assert raised.value.code == "ground_truth_malformed"
+
+
+def test_a_png_that_opencv_refuses_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "depth.png"
+    write_depth_png(path, np.ones((4, 4), np.float32))
+    data = path.read_bytes()
+    path.write_bytes(data[:33] + data[-12:])  # header and end, nothing between
+    with pytest.raises(DatasetError, match="bytes that are none") as raised:
+        read_depth_png(path)
+    assert raised.value.code == "ground_truth_malformed"
+
+
+@pytest.mark.parametrize(("limits", "found"), [({"max_bytes": 50}, "bytes"), ({"max_pixels": 15}, "4x4")])
+def test_a_png_beyond_the_limits_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limits: dict[str, int], found: str
+) -> None:
+    monkeypatch.setattr(ground_truth_png, "LIMITS", ImageLimits(**limits))
+    write_depth_png(tmp_path / "depth.png", np.ones((4, 4), np.float32))
+    with pytest.raises(DatasetError, match=found) as raised:
+        read_depth_png(tmp_path / "depth.png")
+    assert raised.value.code == "ground_truth_malformed"
+
+
 def test_pngs_of_the_wrong_kind_are_named(tmp_path: Path, root: Path) -> None:
     write_depth_png(tmp_path / "depth.png", np.ones((4, 4), np.float32))
     with pytest.raises(DatasetError, match="3 channel") as channels:
@@ -145,6 +184,18 @@ def test_found_at_root_and_mav0_and_nowhere_else(root: Path, tmp_path: Path) -> 
     with pytest.raises(DatasetError, match="groundtruth0") as raised:
         SimulatedGroundTruth(tmp_path)
     assert raised.value.code == "ground_truth_missing"
+
+
+def test_found_beside_mav0_where_that_has_none(root: Path) -> None:
+    """``groundtruth euroc X --out X``, read by both ways."""
+    rendered(root)
+    beside = root / "groundtruth0"
+    assert ground_truth_folder(root) == root / "mav0" / "groundtruth0"
+    shutil.rmtree(root / "mav0" / "groundtruth0")
+    found = SimulatedGroundTruth.find(root)
+    assert found is not None
+    assert found.folder == SimulatedGroundTruth(root).folder == ground_truth_folder(root) == beside
+    assert found.is_rendered
 
 
 def test_static_flow_of_neighbours_is_the_stored_one(root: Path) -> None:
@@ -223,7 +274,6 @@ def test_missing_objects_file_is_named(root: Path) -> None:
         "resolution: [4, 4]",
         SENSOR_YAML.replace("[40, 32]", "[40]"),
         SENSOR_YAML.replace("50.0, 50.0,", "fifty, 50.0,"),
-        SENSOR_YAML.replace("data: [1.0,", "data: ["),
         "just text",
         SENSOR_YAML.replace("50.0, 50.0,", "-50.0, 50.0,"),
     ],
@@ -236,8 +286,29 @@ def test_unusable_calibration_is_named(root: Path, text: str | None) -> None:
     assert raised.value.code == "ground_truth_malformed"
 
 
+def test_poses_need_the_states_and_the_mounting(root: Path) -> None:
+    sensor, states = root / "mav0/cam0/sensor.yaml", root / "mav0/state_groundtruth_estimate0/data.csv"
+    sensor.write_text(SENSOR_YAML.replace("data: [1.0,", "data: ["))
+    with pytest.raises(DatasetError, match=r"sensor\.yaml: data: expected 16") as malformed:
+        SimulatedGroundTruth(root).camera_pose(STAMPS[0])
+    assert malformed.value.code == "ground_truth_malformed"
+    sensor.write_text(SENSOR_YAML)
+    states.unlink()
+    with pytest.raises(DatasetError, match=r"data\.csv: expected the simulated states") as missing:
+        SimulatedGroundTruth(root).camera_pose(STAMPS[0])
+    assert missing.value.code == "ground_truth_missing"
+
+
+def test_opencvs_yaml_and_a_lens_are_read_as_the_recordings(root: Path) -> None:
+    lens = "distortion_model: radial-tangential\ndistortion_coefficients: [-0.28, 0.07, 2e-4, 1.8e-5]\n"
+    (root / "mav0/cam0/sensor.yaml").write_text("%YAML:1.0" + SENSOR_YAML + lens)
+    assert SimulatedGroundTruth(root).camera.distortion_coeffs == (-0.28, 0.07, 2e-4, 1.8e-5)
+
+
 def test_camera_of_the_sequence(root: Path) -> None:
-    camera = SimulatedGroundTruth(root).camera
+    truth = SimulatedGroundTruth(root)
+    camera = truth.camera
+    assert (truth.camera_name, truth.is_rendered, truth.has_instances) == ("cam0", False, True)
     assert (camera.fx, camera.cx, camera.width, camera.height) == (50.0, 20.0, 40, 32)
 
 
@@ -263,6 +334,15 @@ def test_rendered_ground_truth_is_valid_only_where_depth_is_known(tmp_path: Path
     assert not valid[:16].any()
     np.testing.assert_allclose(flow[16:, :, 0], expected, atol=1e-4)
     assert not flow[:16].any()
+
+
+def test_rendered_ground_truth_without_its_poses(tmp_path: Path) -> None:
+    truth = rendered(tmp_path)
+    assert (truth.camera_name, truth.has_instances) == (None, False)
+    (truth.folder / "poses.csv").unlink()
+    with pytest.raises(DatasetError, match=r"poses\.csv") as raised:
+        truth.camera_pose(STAMPS[0])
+    assert raised.value.code == "ground_truth_missing"
 
 
 def test_the_next_frame_is_the_next_pose_not_the_next_depth(tmp_path: Path) -> None:
@@ -296,7 +376,17 @@ def test_occluded_is_stored_or_comes_from_both_depths(root: Path) -> None:
     assert raised.value.code == "ground_truth_missing"
 
 
-@pytest.mark.parametrize("record", ["{}", "[]", "{", '{"camera": {"fx": 1}}', "[" * 100_000, '"camera"'])
+CAMERA = '{"fx": 50.0, "fy": 50.0, "cx": 20.0, "cy": 16.0, "width": 40, "height": 32}'
+
+
+def test_the_recorded_camera(tmp_path: Path) -> None:
+    assert rendered(tmp_path, f'{{"camera": {CAMERA}, "camera_name": "cam1"}}').camera_name == "cam1"
+
+
+@pytest.mark.parametrize(
+    "record",
+    [f'{{"camera": {CAMERA}, "camera_name": 1}}', "{}", "[]", "{", '{"camera": {"fx": 1}}', "[" * 100_000, '"camera"'],
+)
 def test_a_malformed_record_is_named(tmp_path: Path, record: str) -> None:
     truth = rendered(tmp_path, record)
     with pytest.raises(DatasetError, match=r"ground_truth\.json") as raised:

@@ -44,6 +44,7 @@ GOOD = struct.pack("<4sii2f", b"PIEH", 1, 1, 0.0, 0.0)
         (b"PIEI" + GOOD[4:], "found b'PIEI"),
         (GOOD[:-1], "expected 20 bytes for 1x1 px, found 19"),
         (GOOD + b"\0", "found 21"),
+        (struct.pack("<4sii", b"PIEH", 400_000, 400_000), "1280000000012 bytes for 400000x400000 px, found 12"),
         (struct.pack("<4sii", b"PIEH", 0, 1), "found 0x1"),
         (struct.pack("<4sii", b"PIEH", 1, -1), "found 1x-1"),
     ],

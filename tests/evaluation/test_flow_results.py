@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +102,54 @@ def test_malformed_files(tmp_path: Path, suffix: str, code: str, data: bytes) ->
     (tmp_path / "drone_1").mkdir()
     (tmp_path / f"drone_1/100{suffix}").write_bytes(data)
     assert refusal(tmp_path).code == code
+
+
+HUGE = (400_000, 400_000, 2)
+
+
+def npy_head(version: tuple[int, int], shape: tuple[int, ...]) -> bytes:
+    return npy_header(version, f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n".encode())
+
+
+def npy_header(version: tuple[int, int], text: bytes) -> bytes:
+    length = struct.pack("<H" if version == (1, 0) else "<I", len(text))
+    return b"\x93NUMPY" + bytes(version) + length + text
+
+
+@pytest.mark.parametrize("version", [(1, 0), (2, 0)])
+def test_a_header_is_compared_before_what_it_promises_is_read(tmp_path: Path, version: tuple[int, int]) -> None:
+    (tmp_path / "drone_1").mkdir()
+    path = tmp_path / "drone_1/100.npy"
+    path.write_bytes(npy_head(version, HUGE))
+    assert "(400000, 400000, 2)" in refusal(tmp_path).message
+    path.write_bytes(npy_head(version, FLOW.shape) + FLOW.tobytes())
+    np.testing.assert_array_equal(ResultFiles("other", tmp_path, [NEXT]).flow(PAIR, NEXT), FLOW)
+    path.write_bytes(npy_head(version, FLOW.shape) + FLOW.tobytes()[:-1])
+    assert refusal(tmp_path).code == "results_malformed"
+
+
+@pytest.mark.parametrize("text", [b"(", b"-" * 9000 + b"1", b"{[]: 1}", b"  1\n 2\n", b"[", b"1 +", b"\xff", b""])
+def test_a_header_that_is_none(tmp_path: Path, text: bytes) -> None:
+    (tmp_path / "drone_1").mkdir()
+    (tmp_path / "drone_1/100.npy").write_bytes(npy_header((1, 0), text))
+    assert refusal(tmp_path).code == "results_malformed"
+
+
+def test_an_array_of_a_later_format(tmp_path: Path) -> None:
+    (tmp_path / "drone_1").mkdir()
+    (tmp_path / "drone_1/100.npy").write_bytes(npy_head((3, 0), FLOW.shape) + FLOW.tobytes())
+    assert "format (3, 0)" in refusal(tmp_path).message
+
+
+def test_a_picture_that_claims_to_be_huge(tmp_path: Path) -> None:
+    path = tmp_path / "drone_1/100.png"
+    write(path)
+    data = path.read_bytes()
+    head = data[12:16] + struct.pack(">II", 100_000, 100_000) + data[24:29]
+    path.write_bytes(data[:12] + head + struct.pack(">I", zlib.crc32(head)) + data[33:])
+    error = refusal(tmp_path)
+    assert error.code == "ground_truth_malformed"
+    assert "100000x100000" in error.message
 
 
 def test_an_array_of_something_else(tmp_path: Path) -> None:

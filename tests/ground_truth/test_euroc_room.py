@@ -14,6 +14,7 @@ from worlds import EUROC, START_NS
 
 from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
 from viflow_anomaly.errors import DatasetError
+from viflow_anomaly.evaluation.flow_truth import RecordingTruth
 from viflow_anomaly.ground_truth.euroc_room import RoomSummary, render_room
 
 CAMERA = EUROC.scaled_to(188, 120)
@@ -144,6 +145,60 @@ def test_other_files_need_overwrite(recording: Path) -> None:
     assert contents(recording / "mav0/groundtruth0") == before
     assert render_room(recording, overwrite=True).rendered == 2
     assert contents(recording / "mav0/groundtruth0") != before
+
+
+def test_other_states_need_overwrite(recording: Path) -> None:
+    """Pictures of the old poses beside a table of the new ones would be told by nothing."""
+    render_room(recording)
+    write_states(recording / "mav0", [POSES[1], POSES[0]], STAMPS[:2])
+    before = contents(recording / "mav0/groundtruth0")
+    with pytest.raises(DatasetError, match="poses") as raised:
+        render_room(recording)
+    assert raised.value.code == "ground_truth_differs"
+    assert contents(recording / "mav0/groundtruth0") == before
+    render_room(recording, overwrite=True)
+    np.testing.assert_allclose(SimulatedGroundTruth(recording).camera_pose(STAMPS[0]), POSES[1], atol=1e-9)
+
+
+def test_another_camera_needs_overwrite(recording: Path) -> None:
+    shutil.copytree(recording / "mav0/cam0", recording / "mav0/cam1")
+    render_room(recording)
+    with pytest.raises(DatasetError) as raised:
+        render_room(recording, camera="cam1")
+    assert raised.value.code == "ground_truth_differs"
+    render_room(recording, camera="cam1", overwrite=True)
+    assert SimulatedGroundTruth(recording).camera_name == "cam1"
+    with pytest.raises(DatasetError) as raised:
+        RecordingTruth(recording)
+    assert raised.value.code == "ground_truth_camera_differs"
+
+
+def test_flow_that_is_not_there_is_made_not_counted(recording: Path) -> None:
+    folder = render_room(recording).folder
+    (folder / "static_flow" / f"{STAMPS[0]}.png").unlink()
+    again = render_room(recording)
+    assert (again.rendered, again.kept, again.with_flow) == (1, 1, 1)
+    assert (folder / "static_flow" / f"{STAMPS[0]}.png").is_file()
+
+
+def test_a_pose_more_than_before_needs_overwrite(recording: Path) -> None:
+    """The frame before it would stay without flow."""
+    write_states(recording / "mav0", POSES[:1], STAMPS[:1])
+    assert render_room(recording).with_flow == 0
+    write_states(recording / "mav0", POSES, STAMPS)
+    with pytest.raises(DatasetError) as raised:
+        render_room(recording)
+    assert raised.value.code == "ground_truth_differs"
+    assert render_room(recording, overwrite=True).with_flow == 1
+
+
+def test_states_are_of_the_imus_clock(recording: Path) -> None:
+    sensor = recording / "mav0/cam0/sensor.yaml"
+    shift_ns = 2_000_000
+    sensor.write_text(sensor.read_text() + "timeshift_cam_imu: 0.002\n")
+    write_states(recording / "mav0", POSES, [stamp + shift_ns for stamp in STAMPS])
+    assert render_room(recording).rendered == 2
+    np.testing.assert_allclose(SimulatedGroundTruth(recording).camera_pose(STAMPS[1]), POSES[1], atol=1e-9)
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from worlds import make_world, write_euroc, write_lines
 
-from viflow_anomaly.datasets.euroc import read_T_body_cam
+from viflow_anomaly.datasets.euroc import read_camera_on_body
 from viflow_anomaly.datasets.trajectory import Trajectory, rotations_of
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.geometry import so3_exp
@@ -25,7 +25,12 @@ def along_x(stamps_ms: list[int]) -> Trajectory:
     return Trajectory(np.array(stamps_ms, dtype=np.int64) * MS, poses, "test")
 
 
-def test_the_nearest_pose_within_a_millisecond_is_the_frames_own() -> None:
+def test_a_pose_within_a_millisecond_is_no_excuse_not_to_interpolate() -> None:
+    found = poses_of_frames(along_x([100, 105, 115]), [105 * MS, 105 * MS + 256_000, 114 * MS + 500_000])
+    np.testing.assert_allclose([pose[0, 3] for pose in found.values()], [0.105, 0.105256, 0.1145], rtol=0, atol=1e-12)
+
+
+def test_where_a_neighbour_is_missing_the_nearest_pose_within_a_millisecond_is_taken() -> None:
     found = poses_of_frames(along_x([100, 150, 200]), [99 * MS, 100 * MS + 256, 151 * MS, 200 * MS + MS])
     assert [pose[0, 3] for pose in found.values()] == [0.1, 0.1, 0.15, 0.2]
 
@@ -72,7 +77,18 @@ def test_every_format_gives_the_same_camera(tmp_path: Path, cam_yaml: Path, line
     write_lines(tmp_path / "poses.txt", lines)
     trajectory = read_trajectory_file(tmp_path / "poses.txt", cam_yaml)
     assert trajectory.timestamps_ns.tolist() == [1_500_000_000_000_000_256]
-    np.testing.assert_allclose(trajectory.T_world_cam[0], body_pose() @ read_T_body_cam(cam_yaml), atol=1e-12)
+    mounting = read_camera_on_body(cam_yaml)
+    assert mounting is not None
+    np.testing.assert_allclose(trajectory.T_world_cam[0], body_pose() @ mounting.T_body_cam, atol=1e-12)
+
+
+@pytest.mark.parametrize("line", ["1500000000000000256,1,2,3,1,0,0,0", "1500000000.000000256 1 2 3 0 0 0 1"])
+def test_stamps_of_the_body_become_the_cameras(tmp_path: Path, cam_yaml: Path, line: str) -> None:
+    """t_imu = t_cam + shift."""
+    write_lines(cam_yaml, [cam_yaml.read_text(), "timeshift_cam_imu: -0.0125"])
+    write_lines(tmp_path / "poses.txt", [line])
+    trajectory = read_trajectory_file(tmp_path / "poses.txt", cam_yaml)
+    assert trajectory.timestamps_ns.tolist() == [1_500_000_000_012_500_256]
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +125,41 @@ def test_a_second_run_goes_on(drive: Path) -> None:
     (first.folder / "depth" / f"{STAMPS[2]}.png").unlink()
     again = render_lidar(drive)
     assert (again.written, again.kept, again.with_flow) == (1, 2, 2)
+
+
+def other_scan(drive: Path) -> None:
+    path = drive / "velodyne_points/data/0000000002.bin"
+    path.write_bytes(path.read_bytes()[:-16])
+
+
+def other_pose(drive: Path) -> None:
+    path = drive / "oxts/data/0000000003.txt"
+    path.write_text(path.read_text().replace("112.0", "112.5"))
+
+
+def other_scanner(drive: Path) -> None:
+    path = drive.parent / "calib_imu_to_velo.txt"
+    path.write_text(path.read_text().replace("-0.8", "-0.9", 1))
+
+
+def other_labels(drive: Path) -> None:
+    label(drive, 0, LABEL.format(kind="Car", **BOX))
+
+
+def other_motion(drive: Path) -> None:
+    motion(drive, "1")
+
+
+@pytest.mark.parametrize("change", [other_scan, other_pose, other_scanner, other_labels, other_motion])
+def test_what_it_was_made_from_must_not_change(drive: Path, change: Callable[[Path], None]) -> None:
+    folder = render_lidar(drive).folder
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    change(drive)
+    with pytest.raises(DatasetError, match="--overwrite") as raised:
+        render_lidar(drive)
+    assert raised.value.code == "ground_truth_differs"
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    assert render_lidar(drive, overwrite=True).written == 3
 
 
 @pytest.mark.parametrize("content", [b"", b"\0" * 15, b"\0" * 17])

@@ -9,6 +9,7 @@ import pytest
 from room import write_ply
 
 from viflow_anomaly.errors import DatasetError, TooLargeError
+from viflow_anomaly.ground_truth import ply
 from viflow_anomaly.ground_truth.ply import read_ply_points
 
 POINTS = np.array([[0.5, -1.25, 3.0], [1e-3, 2.0, -7.5], [4.0, 5.0, 6.0]], np.float32)
@@ -39,6 +40,17 @@ def test_binary_elements_before_the_points_are_skipped(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_ply_points(tmp_path / "data.ply"), POINTS[:1])
 
 
+def test_the_shortest_lines_there_are(tmp_path: Path) -> None:
+    (tmp_path / "data.ply").write_bytes(HEADER + b"1 2 3\n4 5 6")
+    np.testing.assert_array_equal(read_ply_points(tmp_path / "data.ply"), [[1, 2, 3], [4, 5, 6]])
+
+
+def test_binary_points_are_read_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ply, "BLOCK_BYTES", 40)  # a row of write_ply has 19 bytes
+    write_ply(tmp_path / "data.ply", POINTS)
+    np.testing.assert_array_equal(read_ply_points(tmp_path / "data.ply"), POINTS)
+
+
 def test_points_without_return_are_left_out(tmp_path: Path) -> None:
     write_ply(tmp_path / "data.ply", np.vstack([POINTS, [[np.nan, 0, 0]], [[0, np.inf, 0]]]).astype(np.float32))
     np.testing.assert_array_equal(read_ply_points(tmp_path / "data.ply"), POINTS)
@@ -60,7 +72,11 @@ def test_points_without_return_are_left_out(tmp_path: Path) -> None:
         (HEADER.replace(b"vertex", b"face"), "element vertex"),
         (HEADER.replace(b"float z", b"float w"), "no number z"),
         (HEADER.replace(b"float z", b"float z\nproperty list uchar int more"), "a list in vertex"),
-        (HEADER + b"1 2 3\n", "ends after 1"),
+        (HEADER + b"1 2 3\n", "2 lines of x y z, found only 6 bytes"),
+        (HEADER.replace(b"vertex 2", b"vertex 99999999") + b"1 2 3\n", "found only 6 bytes"),
+        (HEADER + b"1.00 2.00 3.00\n", "ends after 1"),
+        (HEADER + b"1 2 3\n" + b"4" * 70_000 + b" 5 6\n", "less than 65536 bytes"),
+        (HEADER.replace(b"element vertex", b"element a 1\nelement vertex") + b"0" * 70_000 + b"\n", "less than 65536"),
         (HEADER + b"1 2 3\n1 2\n", "2 lines of x y z"),
         (HEADER + b"1 2 3\n1 2 three\n", "2 lines of x y z"),
         (HEADER + b"1 2 3\n1 2 \xff\n", "2 lines of x y z"),

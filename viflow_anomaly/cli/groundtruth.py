@@ -40,7 +40,7 @@ def euroc(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Poses of the body instead of the recording's states: EuRoC or OpenVINS csv, or TUM.",
+            help="Poses of the body, in its clock, instead of the recording's states: EuRoC or OpenVINS csv, or TUM.",
             show_default=False,
         ),
     ] = None,
@@ -49,7 +49,8 @@ def euroc(
 ) -> None:
     """Render depth and static flow from the point cloud of EuRoC's Vicon room (the paper's ground truth).
 
-    Frames without a pose within 1 ms are left out. See docs/ground_truth.md for layout and accuracy.
+    A frame's pose is interpolated between two at most 10 ms apart, else the nearest one within 1 ms; frames without
+    are left out. See docs/ground_truth.md for layout and accuracy.
 
     [bold]Examples[/bold]
 

@@ -16,7 +16,8 @@ mav0/
 ```
 
 ``T_BS`` maps sensor coordinates to the body, so ``T_cam_imu = inv(T_BS_cam) @ T_BS_imu``. A ``timeshift_cam_imu`` in
-the camera's file (Kalibr's key, seconds, t_imu = t_cam + shift) is honoured; EuRoC itself has none.
+the camera's file (Kalibr's key, seconds, t_imu = t_cam + shift) is honoured, for the states too, whose clock is the
+IMU's; EuRoC itself has none.
 """
 
 from __future__ import annotations
@@ -25,22 +26,24 @@ import re
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
 
 from viflow_anomaly.config import ImageLimits
 from viflow_anomaly.datasets.motor_table import read_motor
-from viflow_anomaly.datasets.recording import FileRecording
+from viflow_anomaly.datasets.recording import FileRecording, choose_camera
 from viflow_anomaly.datasets.tables import csv_malformed, read_frame_list, read_lines, read_stamped_numbers, read_text
 from viflow_anomaly.datasets.trajectory import Trajectory, rigid, rotations_of
 from viflow_anomaly.errors import DatasetError, InvalidInputError
 from viflow_anomaly.imu_log import ImuLog
-from viflow_anomaly.sensor_data import Float64Array, PinholeCamera
+from viflow_anomaly.sensor_data import Float64Array, Int64Array, PinholeCamera
 
 NEEDS = "mav0/ (or its content) with imu0/data.csv and cam*/data.csv"
 MIN_QUATERNION_LENGTH = 1e-3
+BODY_POSE_RULE = f"expected a later stamp than before and a quaternion longer than {MIN_QUATERNION_LENGTH:g}"
+TIME_OFFSET_KEY = "timeshift_cam_imu"
 DISTORTION_NAMES = {
     "radial-tangential": "radtan",
     "radtan": "radtan",
@@ -74,11 +77,7 @@ def open_euroc(root: Path, *, camera: str | None, limits: ImageLimits) -> FileRe
             ``yaml_malformed``, ``calibration_malformed``, ``motor_not_covering``; the trajectory is read when
             it is asked for.
     """
-    chosen = camera or _cameras(root)[0]
-    if chosen not in _cameras(root):
-        raise DatasetError(
-            f"{root}: expected one of {', '.join(_cameras(root))}, found camera {chosen!r}", code="camera_unknown"
-        )
+    chosen = choose_camera(root, _cameras(root), camera)
     folder = root / chosen
     frames = read_frame_list(folder / "data.csv", ("timestamp", "filename"), folder / "data", header="comment")
     imu_stamps, values = read_stamped_numbers(root / "imu0" / "data.csv", IMU_COLUMNS, header="comment")
@@ -90,6 +89,7 @@ def open_euroc(root: Path, *, camera: str | None, limits: ImageLimits) -> FileRe
         root=root,
         format="euroc",
         camera=calibration,
+        camera_name=chosen,
         imu=ImuLog(imu_stamps, values[:, :3], values[:, 3:]),
         frame_timestamps_ns=frames.timestamps_ns,
         frame_paths=tuple(frames.paths),
@@ -127,7 +127,6 @@ def read_camera(cam_yaml: Path, imu_yaml: Path) -> PinholeCamera | None:
     if not width.is_integer() or not height.is_integer():
         raise _malformed(cam_yaml, f"resolution: expected whole pixels, found {width}x{height}")
     coefficients = _numbers(cam_yaml, sensor, "distortion_coefficients", None) if model != "none" else []
-    offset = _numbers(cam_yaml, {"timeshift_cam_imu": [sensor.get("timeshift_cam_imu", 0.0)]}, "timeshift_cam_imu", 1)
     try:
         return PinholeCamera(
             fx=fx,
@@ -139,35 +138,64 @@ def read_camera(cam_yaml: Path, imu_yaml: Path) -> PinholeCamera | None:
             distortion_model=model,
             distortion_coeffs=tuple(coefficients),
             T_cam_imu=_mounting(cam_yaml, sensor, imu_yaml),
-            time_offset_s=offset[0],
+            time_offset_s=_time_offset_s(cam_yaml, sensor),
         )
     except InvalidInputError as err:
         raise _malformed(cam_yaml, err.message) from err
 
 
 def read_trajectory(states: Path, cam_yaml: Path) -> Trajectory | None:
-    """Poses of the camera from the body's states and the camera's ``T_BS``; None where either file is not there.
+    """Poses of the camera, in its clock, from the body's states and the camera's file; None where either is not there.
 
     Raises:
-        DatasetError: ``csv_malformed`` (also stamps that do not increase, or a quaternion of length 0),
-            ``yaml_malformed``, ``calibration_malformed``.
+        DatasetError: as ``read_body_poses`` and ``read_camera_on_body``.
     """
-    T_body_cam = read_T_body_cam(cam_yaml)
-    if T_body_cam is None or not states.is_file():
+    mounting = read_camera_on_body(cam_yaml)
+    if mounting is None or not states.is_file():
         return None
-    first = next((line.text for line in read_lines(states) if not line.text.startswith("#")), "")
-    columns = POSE_COLUMNS if first.count(",") == len(POSE_COLUMNS) - 1 else STATE_COLUMNS
-    stamps, values = read_stamped_numbers(states, columns, header="comment")
-    wrong = np.flatnonzero(np.diff(stamps) <= 0) + 1
-    if not wrong.size:
-        wrong = np.flatnonzero(np.linalg.norm(values[:, 3:7], axis=1) < MIN_QUATERNION_LENGTH)
+    stamps, T_world_body = read_body_poses(states)
+    return mounting.trajectory(stamps, T_world_body, str(states))
+
+
+def read_body_poses(path: Path) -> tuple[Int64Array, Float64Array]:
+    """Stamps [N], as the file has them, and T_world_body [N, 4, 4] from a table of states or of poses alone.
+
+    Raises:
+        DatasetError: ``csv_malformed`` (also stamps that do not increase, or a quaternion of no length),
+            ``file_missing``, ``text_not_utf8``.
+    """
+    lines = [line for line in read_lines(path) if not line.text.startswith("#")]
+    pose_only = bool(lines) and lines[0].text.count(",") == len(POSE_COLUMNS) - 1
+    stamps, values = read_stamped_numbers(path, POSE_COLUMNS if pose_only else STATE_COLUMNS, header="comment")
+    later = np.append(True, np.diff(stamps) > 0)
+    wrong = np.flatnonzero(~later | (np.linalg.norm(values[:, 3:7], axis=1) < MIN_QUATERNION_LENGTH))
     if wrong.size:
-        problem = f"expected increasing stamps and quaternions of length 1, found {stamps[wrong[0]]}, "
-        raise csv_malformed(
-            states, int(wrong[0]) + 1, problem + f"{values[wrong[0], 3:7].tolist()} in this row of data"
-        )
-    T_world_body = rigid(rotations_of(values[:, 3:7]), values[:, :3])
-    return Trajectory(stamps, T_world_body @ T_body_cam, str(states))
+        problem = f"{BODY_POSE_RULE}, found {lines[wrong[0]].text[:160]!r}"
+        raise csv_malformed(path, lines[wrong[0]].number, problem)
+    return stamps, rigid(rotations_of(values[:, 3:7]), values[:, :3])
+
+
+class CameraOnBody(NamedTuple):
+    """T_body_cam [4, 4], and what to add to a stamp of the camera's clock to have the body's (the IMU's)."""
+
+    T_body_cam: Float64Array
+    time_offset_ns: int
+
+    def trajectory(self, body_stamps_ns: Int64Array, T_world_body: Float64Array, origin: str) -> Trajectory:
+        """Poses of the body [N, 4, 4] at stamps [N] of its clock -> those of the camera in the camera's clock."""
+        return Trajectory(body_stamps_ns - self.time_offset_ns, T_world_body @ self.T_body_cam, origin)
+
+
+def read_camera_on_body(cam_yaml: Path) -> CameraOnBody | None:
+    """The camera's ``T_BS`` and time offset; None without the file.
+
+    Raises:
+        DatasetError: ``yaml_malformed``, ``calibration_malformed``.
+    """
+    if not cam_yaml.is_file():
+        return None
+    sensor = _read_yaml(cam_yaml)
+    return CameraOnBody(_read_T_BS(cam_yaml, sensor), round(_time_offset_s(cam_yaml, sensor) * 1e9))
 
 
 def _mounting(cam_yaml: Path, sensor: Mapping[str, Any], imu_yaml: Path) -> Float64Array | None:
@@ -176,15 +204,6 @@ def _mounting(cam_yaml: Path, sensor: Mapping[str, Any], imu_yaml: Path) -> Floa
     T_BS_cam = _read_T_BS(cam_yaml, sensor)
     T_BS_imu = _read_T_BS(imu_yaml, _read_yaml(imu_yaml))
     return np.asarray(np.linalg.inv(T_BS_cam) @ T_BS_imu)
-
-
-def read_T_body_cam(cam_yaml: Path) -> Float64Array | None:
-    """The camera's ``T_BS`` [4, 4]; None without the file.
-
-    Raises:
-        DatasetError: ``yaml_malformed``, ``calibration_malformed``.
-    """
-    return _read_T_BS(cam_yaml, _read_yaml(cam_yaml)) if cam_yaml.is_file() else None
 
 
 def read_cloud_pose(path: Path) -> Float64Array:
@@ -204,9 +223,16 @@ def _read_T_BS(path: Path, sensor: Mapping[str, Any]) -> Float64Array:
     if not isinstance(matrix, Mapping):
         raise _malformed(path, "T_BS: expected a matrix of 4 rows and 4 columns, found none")
     T_BS = np.array(_numbers(path, matrix, "data", 16)).reshape(4, 4)
-    if not np.allclose(T_BS[:3, :3] @ T_BS[:3, :3].T, np.eye(3), atol=1e-3):
-        raise _malformed(path, "T_BS: expected a rigid transform, found a matrix whose rotation is not orthonormal")
+    rotation = T_BS[:3, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise _malformed(path, "T_BS: expected a rigid transform, found a matrix whose first 3x3 is no rotation")
+    if T_BS[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
+        raise _malformed(path, f"T_BS: expected a rigid transform with the last row 0 0 0 1, found {T_BS[3].tolist()}")
     return T_BS
+
+
+def _time_offset_s(path: Path, sensor: Mapping[str, Any]) -> float:
+    return _numbers(path, {TIME_OFFSET_KEY: [sensor.get(TIME_OFFSET_KEY, 0.0)]}, TIME_OFFSET_KEY, 1)[0]
 
 
 def _read_yaml(path: Path) -> Mapping[str, Any]:

@@ -14,7 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from viflow_anomaly.errors import DatasetError
+from viflow_anomaly.config import ImageLimits
+from viflow_anomaly.errors import DatasetError, InvalidInputError
+from viflow_anomaly.images import read_image_size
 from viflow_anomaly.sensor_data import Uint8Array
 
 Float32Array = NDArray[np.float32]
@@ -24,6 +26,9 @@ FLOW_STEPS_PER_PX = 64.0
 FLOW_ZERO = 2**15
 DEPTH_STEPS_PER_M = 256.0
 UINT16_MAX = 65535
+LIMITS = ImageLimits()
+PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
+"""OpenCV reads a file that ends before it without complaint."""
 
 
 def _write_png(path: Path, image: NDArray[Any]) -> None:
@@ -35,16 +40,14 @@ def _write_png(path: Path, image: NDArray[Any]) -> None:
 
 
 def _read_png(path: Path, channels: int, kind: str, dtype: type[np.unsignedinteger[Any]]) -> NDArray[Any]:
+    data = _checked_bytes(path, kind)
     try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError as err:
-        raise DatasetError(
-            f"{path}: expected a {kind} PNG, cannot read it: {err.strerror}", code="ground_truth_missing"
-        ) from err
-    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
     if image is None:
         raise DatasetError(
-            f"{path}: expected a {kind} PNG, found {data.size} bytes that are none", code="ground_truth_malformed"
+            f"{path}: expected a {kind} PNG, found {len(data)} bytes that are none", code="ground_truth_malformed"
         )
     shape = image.shape[2] if image.ndim == 3 else 1
     if shape != channels or image.dtype != dtype:
@@ -54,6 +57,25 @@ def _read_png(path: Path, channels: int, kind: str, dtype: type[np.unsignedinteg
             code="ground_truth_malformed",
         )
     return np.asarray(image)
+
+
+def _checked_bytes(path: Path, kind: str) -> bytes:
+    """The file, if its size and its header promise no more than an image may have, and if it reaches its end."""
+    try:
+        read_image_size(path, limits=LIMITS, field=f"{kind} PNG")
+        data = path.read_bytes()
+    except (DatasetError, OSError) as err:
+        raise DatasetError(
+            f"{path}: expected a {kind} PNG, cannot read it: {err}", code="ground_truth_missing"
+        ) from err
+    except InvalidInputError as err:
+        raise DatasetError(err.message, code="ground_truth_malformed") from err
+    if PNG_END not in data:
+        raise DatasetError(
+            f"{path}: expected a {kind} PNG, found {len(data)} bytes without a PNG's last chunk",
+            code="ground_truth_malformed",
+        )
+    return data
 
 
 def write_flow_png(path: Path, flow: Float32Array, valid: BoolArray) -> None:

@@ -17,12 +17,13 @@ Frame numbers of the benchmarks are those of the ``_sync`` drives. ``_extract`` 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
 from viflow_anomaly.datasets.kitti_calibration import CalibrationFiles
-from viflow_anomaly.datasets.kitti_files import OxtsRow, read_oxts_folder, read_stamps
+from viflow_anomaly.datasets.kitti_files import OxtsFolder, OxtsRow, read_stamps
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.sensor_data import Int64Array
 
@@ -75,10 +76,15 @@ class RawDrive:
     Args:
         raw_data: holds the folders of the days.
         name: ``2011_10_03_drive_0027``.
+
+    Lists of stamps and files are read once, when they are first asked for.
     """
 
     raw_data: Path
     name: str
+    _frame_stamps: dict[str, tuple[Path, dict[int, int]]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     @property
     def day(self) -> Path:
@@ -94,6 +100,11 @@ class RawDrive:
         Raises:
             DatasetError: ``kitti_raw_missing``, ``timestamps_malformed``, ``text_not_utf8``.
         """
+        if camera not in self._frame_stamps:
+            self._frame_stamps[camera] = self._read_frame_stamps(camera)
+        return self._frame_stamps[camera]
+
+    def _read_frame_stamps(self, camera: str) -> tuple[Path, dict[int, int]]:
         drive = self.day / f"{self.name}_sync"
         for folder in (f"image_{camera}", "oxts"):
             path = drive / folder / "timestamps.txt"
@@ -105,12 +116,16 @@ class RawDrive:
         """The 100 Hz records between two stamps, as they were recorded.
 
         Raises:
-            DatasetError: ``kitti_raw_missing``, and those of ``read_oxts_folder``.
+            DatasetError: ``kitti_raw_missing``, and those of ``OxtsFolder`` and its ``read``.
         """
+        return self._oxts.read((first_ns, last_ns))
+
+    @cached_property
+    def _oxts(self) -> OxtsFolder:
         drive = self.day / f"{self.name}_extract"
         if not (drive / "oxts" / "timestamps.txt").is_file() or not (drive / "oxts" / "data").is_dir():
             raise self._missing(drive, "oxts/timestamps.txt and oxts/data/")
-        return read_oxts_folder(drive / "oxts", (first_ns, last_ns))
+        return OxtsFolder(drive / "oxts")
 
     @staticmethod
     def _missing(drive: Path, files: str) -> DatasetError:

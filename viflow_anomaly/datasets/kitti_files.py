@@ -150,32 +150,53 @@ def read_oxts_file(path: Path) -> OxtsRow:
     return parse_oxts(path, lines[0].number, lines[0].text)
 
 
-def read_oxts_folder(folder: Path, span: tuple[int, int] | None = None) -> tuple[Int64Array, list[OxtsRow]]:
-    """``oxts/``: stamps [N], in the order of the records, and the records.
+class OxtsFolder:
+    """``oxts/``: stamps and files are listed once, records read when they are asked for.
 
     Args:
         folder: holds ``timestamps.txt`` and ``data/``.
-        span: (first, last) nanoseconds: only the records from the first to the last that lie inside, so that disorder
-            among them stays; None: all.
 
     Raises:
-        DatasetError: ``oxts_malformed`` (also without any record), ``imu_not_covering`` (none inside ``span``),
-            ``timestamps_malformed``, ``timestamps_missing``, ``file_name_malformed``, ``file_missing``,
-            ``text_not_utf8``.
+        DatasetError: ``timestamps_malformed``, ``file_name_malformed``, ``file_missing``, ``text_not_utf8``.
     """
-    stamps = read_stamps(folder / "timestamps.txt")
-    files = numbered_files(folder / "data", (".txt",))
-    if span is not None:
-        inside = [number for number in files if number in stamps and span[0] <= stamps[number] <= span[1]]
-        files = {number: file for number, file in files.items() if inside and inside[0] <= number <= inside[-1]}
-    if not files and span is not None:
-        raise DatasetError(
-            f"{folder}: expected records between {span[0]} and {span[1]} ns, found none", code="imu_not_covering"
-        )
-    if not files:
-        raise DatasetError(f"{folder / 'data'}: expected at least one record, found none", code="oxts_malformed")
-    numbers = np.array([stamp_of(folder / "timestamps.txt", stamps, number) for number in files], dtype=np.int64)
-    return numbers, [read_oxts_file(file) for file in files.values()]
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._stamps = read_stamps(folder / "timestamps.txt")
+        self._files = numbered_files(folder / "data", (".txt",))
+
+    def read(self, span: tuple[int, int] | None = None) -> tuple[Int64Array, list[OxtsRow]]:
+        """Stamps [N], in the order of the records, and the records.
+
+        Args:
+            span: (first, last) nanoseconds: only the records from the first to the last that lie inside, so that
+                disorder among them stays; None: all.
+
+        Raises:
+            DatasetError: ``oxts_malformed`` (also without any record), ``imu_not_covering`` (none inside ``span``),
+                ``timestamps_missing``, ``file_missing``, ``text_not_utf8``.
+        """
+        stamps, files = self._stamps, self._files
+        if span is not None:
+            inside = [number for number in files if number in stamps and span[0] <= stamps[number] <= span[1]]
+            files = {number: file for number, file in files.items() if inside and inside[0] <= number <= inside[-1]}
+            if not files:
+                raise DatasetError(
+                    f"{self._folder}: expected records between {span[0]} and {span[1]} ns, found none",
+                    code="imu_not_covering",
+                )
+        if not files:
+            raise DatasetError(
+                f"{self._folder / 'data'}: expected at least one record, found none", code="oxts_malformed"
+            )
+        path = self._folder / "timestamps.txt"
+        numbers = np.array([stamp_of(path, stamps, number) for number in files], dtype=np.int64)
+        return numbers, [read_oxts_file(file) for file in files.values()]
+
+
+def oxts_places(rows: Sequence[OxtsRow]) -> Float64Array:
+    """[N, 6] as ``OxtsRow.place``; the records themselves need not be kept."""
+    return np.array([row.place for row in rows])
 
 
 def oxts_imu(imu_stamps: Int64Array, rows: Sequence[OxtsRow]) -> ImuLog:
@@ -255,6 +276,18 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
             )
         files[int(file.stem)] = file
     return dict(sorted(files.items()))
+
+
+def image_files(folder: Path) -> dict[int, Path]:
+    """{number: image}, as ``numbered_files``.
+
+    Raises:
+        DatasetError: ``no_frames``, ``file_name_malformed``.
+    """
+    images = numbered_files(folder, (".png", ".jpg"))
+    if not images:
+        raise DatasetError(f"{folder}: expected at least one image, found none", code="no_frames")
+    return images
 
 
 def stamp_of(path: Path, stamps: dict[int, int], number: int) -> int:

@@ -72,15 +72,29 @@ def read_labelled_objects(drive: Path) -> dict[int, list[LabelledObject]]:
         DatasetError: ``labels_malformed``, ``csv_malformed``, ``file_name_malformed``, ``text_not_utf8``.
     """
     found: dict[int, list[LabelledObject]] = {}
-    motion_file, folder = drive / MOTION_FILE, drive / "label_2"
+    motion_file = drive / MOTION_FILE
     if motion_file.is_file():
         for number, thing in _motions(motion_file):
             found.setdefault(number, []).append(thing)
-    for number, path in (numbered_files(folder, (".txt",)) if folder.is_dir() else {}).items():
+    for number, path in _label_files(drive).items():
         objects = found.setdefault(number, [])
         known = {thing.box for thing in objects}
         objects += [thing for thing in _labels(path) if thing.box not in known]
     return found
+
+
+def label_files(drive: Path) -> list[Path]:
+    """All files that ``read_labelled_objects`` reads.
+
+    Raises:
+        DatasetError: ``file_name_malformed``.
+    """
+    return [path for path in (drive / MOTION_FILE, *_label_files(drive).values()) if path.is_file()]
+
+
+def _label_files(drive: Path) -> dict[int, Path]:
+    folder = drive / "label_2"
+    return numbered_files(folder, (".txt",)) if folder.is_dir() else {}
 
 
 def label_scale(drive: Path, width: int, height: int) -> tuple[float, float]:

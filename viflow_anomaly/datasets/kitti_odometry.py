@@ -25,33 +25,31 @@ from pathlib import Path
 import numpy as np
 
 from viflow_anomaly.config import ImageLimits
-from viflow_anomaly.datasets.kitti_calibration import read_odometry_camera, read_odometry_shift
+from viflow_anomaly.datasets.kitti_calibration import read_odometry_camera
 from viflow_anomaly.datasets.kitti_files import (
     SPEED_NAMES,
     first_image_size,
-    numbered_files,
+    image_files,
     parse_oxts,
     read_seconds,
     read_stamps,
-    stamp_of,
 )
 from viflow_anomaly.datasets.kitti_poses import read_odometry_trajectory
+from viflow_anomaly.datasets.kitti_sequence import cameras_of, frame_stamps
 from viflow_anomaly.datasets.plain import read_imu
-from viflow_anomaly.datasets.recording import FileRecording
-from viflow_anomaly.datasets.tables import check_increasing, parse_numbers, read_csv, read_lines
-from viflow_anomaly.datasets.trajectory import Trajectory
+from viflow_anomaly.datasets.recording import FileRecording, choose_camera
+from viflow_anomaly.datasets.tables import parse_numbers, read_csv, read_lines
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.imu_log import ImuLog
 from viflow_anomaly.sensor_data import Float64Array, Int64Array
 
 NEEDS = "image_0..3/, times.txt or oxts_timestamps*.txt, and imu_<n>perframe*.csv or imu.csv"
-CAMERAS = ("image_0", "image_2", "image_1", "image_3")
 IMU_COLUMNS = ("sample", "ax", "ay", "az", "wx", "wy", "wz")
 
 
 def find_root(path: Path) -> Path | None:
     """``path`` itself when it is a sequence with an IMU file, else None."""
-    found = _cameras(path) and _stamps_file(path) and (_per_frame_file(path) or (path / "imu.csv").is_file())
+    found = cameras_of(path) and _stamps_file(path) and (_per_frame_file(path) or (path / "imu.csv").is_file())
     return path if found else None
 
 
@@ -68,44 +66,28 @@ def open_kitti_odometry(root: Path, *, camera: str | None, limits: ImageLimits) 
             ``timestamps_not_increasing``, ``csv_malformed``, ``oxts_malformed``, ``file_name_malformed``,
             ``calibration_malformed``.
     """
-    chosen = camera or _cameras(root)[0]
-    if chosen not in _cameras(root):
-        raise DatasetError(
-            f"{root}: expected one of {', '.join(_cameras(root))}, found camera {chosen!r}", code="camera_unknown"
-        )
-    images = numbered_files(root / chosen, (".png", ".jpg"))
-    if not images:
-        raise DatasetError(f"{root / chosen}: expected at least one image, found none", code="no_frames")
+    chosen = choose_camera(root, cameras_of(root), camera)
+    images = image_files(root / chosen)
     stamps_file = _stamps_file(root)
     assert stamps_file is not None
     stamps = read_seconds(stamps_file) if stamps_file.name == "times.txt" else read_stamps(stamps_file)
-    frame_stamps = np.array([stamp_of(stamps_file, stamps, number) for number in images], dtype=np.int64)
-    check_increasing(stamps_file, frame_stamps.tolist(), [number + 1 for number in images])
+    timestamps_ns, every_stamp = frame_stamps(stamps_file, stamps, list(images))
     per_frame = _per_frame_file(root)
     speeds = _read_speeds(root, list(images))
-    every_stamp = np.array([stamps[number] for number in sorted(stamps)], dtype=np.int64)
     return FileRecording(
         name=root.resolve().name,
         root=root,
         format="kitti_odometry",
         camera=read_odometry_camera(root, chosen[-1], first_image_size(images.values(), limits=limits)),
         imu=read_imu(root / "imu.csv") if per_frame is None else _read_per_frame(per_frame, every_stamp),
-        frame_timestamps_ns=frame_stamps,
+        frame_timestamps_ns=timestamps_ns,
+        camera_name=chosen,
         frame_paths=tuple(images.values()),
         motor_commands=speeds,
         motor_names=() if speeds is None else SPEED_NAMES,
         limits=limits,
-        read_trajectory=partial(_read_trajectory, root, chosen[-1], every_stamp),
+        read_trajectory=partial(read_odometry_trajectory, root, chosen[-1], every_stamp),
     )
-
-
-def _read_trajectory(root: Path, number: str, stamps: Int64Array) -> Trajectory | None:
-    T_cam_cam0 = read_odometry_shift(root, number)
-    return None if T_cam_cam0 is None else read_odometry_trajectory(root, stamps, T_cam_cam0)
-
-
-def _cameras(root: Path) -> list[str]:
-    return [name for name in CAMERAS if (root / name).is_dir()]
 
 
 def _stamps_file(root: Path) -> Path | None:

@@ -22,29 +22,24 @@ import re
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from viflow_anomaly.config import ImageLimits
-from viflow_anomaly.datasets.kitti_calibration import read_odometry_camera, read_odometry_shift
+from viflow_anomaly.datasets.kitti_calibration import read_odometry_camera
 from viflow_anomaly.datasets.kitti_drives import ODOMETRY_DRIVES, DriveFrames, RawDrive, find_raw_data
 from viflow_anomaly.datasets.kitti_files import (
     SPEED_NAMES,
     first_image_size,
     forward_speeds,
-    numbered_files,
+    image_files,
     oxts_imu,
     read_seconds,
     stamp_of,
 )
 from viflow_anomaly.datasets.kitti_poses import read_odometry_trajectory
-from viflow_anomaly.datasets.recording import FileRecording
-from viflow_anomaly.datasets.tables import check_increasing
-from viflow_anomaly.datasets.trajectory import Trajectory
+from viflow_anomaly.datasets.kitti_sequence import cameras_of, dataset_of, frame_stamps
+from viflow_anomaly.datasets.recording import FileRecording, choose_camera
 from viflow_anomaly.errors import DatasetError
-from viflow_anomaly.sensor_data import Int64Array
 
 NEEDS = "a folder named 00 to 21 with image_0..3/ and times.txt, and raw_data/ beside sequences/ or above it"
-CAMERAS = ("image_0", "image_2", "image_1", "image_3")
 MARGIN_NS = 1_000_000_000
 """How much IMU is read before the first frame and after the last."""
 MAX_DISAGREEMENT_NS = 50_000_000
@@ -54,7 +49,7 @@ MAX_DISAGREEMENT_NS = 50_000_000
 def find_root(path: Path) -> Path | None:
     """``path`` itself when it is a sequence of the benchmark, else None (with an IMU file: ``kitti_odometry``)."""
     numbered = re.fullmatch(r"[01][0-9]|2[01]", path.resolve().name) is not None
-    return path if numbered and (path / "times.txt").is_file() and _cameras(path) else None
+    return path if numbered and (path / "times.txt").is_file() and cameras_of(path) else None
 
 
 def open_kitti_odometry_raw(root: Path, *, camera: str | None, limits: ImageLimits) -> FileRecording:
@@ -73,22 +68,14 @@ def open_kitti_odometry_raw(root: Path, *, camera: str | None, limits: ImageLimi
             ``calibration_malformed``;
             of the trajectory, when it is asked for: ``poses_malformed``, ``poses_ambiguous``.
     """
-    chosen = camera or _cameras(root)[0]
-    if chosen not in _cameras(root):
-        raise DatasetError(
-            f"{root}: expected one of {', '.join(_cameras(root))}, found camera {chosen!r}", code="camera_unknown"
-        )
-    images = numbered_files(root / chosen, (".png", ".jpg"))
-    if not images:
-        raise DatasetError(f"{root / chosen}: expected at least one image, found none", code="no_frames")
+    chosen = choose_camera(root, cameras_of(root), camera)
+    images = image_files(root / chosen)
     frames = _frames_of(root.resolve().name)
-    drive = RawDrive(find_raw_data(root.resolve().parents[1]), frames.drive)
-    every_stamp = _stamps(root / "times.txt", drive, frames, f"0{chosen[-1]}")
-    stamps = np.array([stamp_of(root / "times.txt", every_stamp, number) for number in images], dtype=np.int64)
-    check_increasing(root / "times.txt", stamps.tolist(), [number + 1 for number in images])
+    drive = RawDrive(find_raw_data(dataset_of(root)), frames.drive)
+    times = _stamps(root / "times.txt", drive, frames, f"0{chosen[-1]}")
+    stamps, every_stamp = frame_stamps(root / "times.txt", times, list(images))
     imu_stamps, rows = drive.oxts(int(stamps[0]) - MARGIN_NS, int(stamps[-1]) + MARGIN_NS)
     size = first_image_size(images.values(), limits=limits)
-    pose_stamps = np.array([every_stamp[number] for number in sorted(every_stamp)], dtype=np.int64)
     return FileRecording(
         name=root.resolve().name,
         root=root,
@@ -96,16 +83,13 @@ def open_kitti_odometry_raw(root: Path, *, camera: str | None, limits: ImageLimi
         camera=read_odometry_camera(root, chosen[-1], size, imu_to_velo=drive.calibration.imu_to_velo),
         imu=oxts_imu(imu_stamps, rows),
         frame_timestamps_ns=stamps,
+        camera_name=chosen,
         frame_paths=tuple(images.values()),
         motor_commands=forward_speeds(stamps, imu_stamps, rows),
         motor_names=SPEED_NAMES,
         limits=limits,
-        read_trajectory=partial(_read_trajectory, root, chosen[-1], pose_stamps),
+        read_trajectory=partial(read_odometry_trajectory, root, chosen[-1], every_stamp),
     )
-
-
-def _cameras(root: Path) -> list[str]:
-    return [name for name in CAMERAS if (root / name).is_dir()]
 
 
 def _frames_of(sequence: str) -> DriveFrames:
@@ -141,8 +125,3 @@ def _stamps(times_file: Path, drive: RawDrive, frames: DriveFrames, camera: str)
                 code="kitti_raw_mismatch",
             )
     return stamps
-
-
-def _read_trajectory(root: Path, number: str, stamps: Int64Array) -> Trajectory | None:
-    T_cam_cam0 = read_odometry_shift(root, number)
-    return None if T_cam_cam0 is None else read_odometry_trajectory(root, stamps, T_cam_cam0)

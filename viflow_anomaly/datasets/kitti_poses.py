@@ -10,12 +10,13 @@ the scale of the first record's latitude, and R = Rz(yaw) Ry(pitch) Rx(roll).
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from viflow_anomaly.datasets.kitti_files import OxtsRow, finite_numbers, malformed
+from viflow_anomaly.datasets.kitti_calibration import read_odometry_shift
+from viflow_anomaly.datasets.kitti_files import finite_numbers, malformed
+from viflow_anomaly.datasets.kitti_sequence import dataset_of
 from viflow_anomaly.datasets.tables import read_lines
 from viflow_anomaly.datasets.trajectory import Trajectory, rigid
 from viflow_anomaly.errors import DatasetError
@@ -31,7 +32,7 @@ def find_poses(sequence: Path) -> Path | None:
     Raises:
         DatasetError: ``poses_ambiguous``.
     """
-    folder, name = sequence.resolve().parents[1] / "poses", sequence.resolve().name
+    folder, name = dataset_of(sequence) / "poses", sequence.resolve().name
     exact = folder / f"{name}.txt"
     if exact.is_file() or not folder.is_dir():
         return exact if exact.is_file() else None
@@ -67,19 +68,22 @@ def read_poses(path: Path, count: int) -> Float64Array:
     return poses
 
 
-def read_odometry_trajectory(sequence: Path, timestamps_ns: Int64Array, T_cam_cam0: Float64Array) -> Trajectory | None:
-    """The poses of one camera of a sequence; None without a file of poses.
+def read_odometry_trajectory(sequence: Path, number: str, timestamps_ns: Int64Array) -> Trajectory | None:
+    """The poses of the camera ``image_<number>`` of a sequence; None without a file of poses, or where no calibration
+    says how that camera lies to the left gray one.
 
     Args:
         sequence: its folder.
-        timestamps_ns: [F] of all frames of the sequence, also of those whose image is not there.
-        T_cam_cam0: [4, 4] from the left gray camera to the camera of the recording.
+        number: ``"0"`` to ``"3"``.
+        timestamps_ns: [N] of all frames of the sequence, also of those whose image is not there.
 
     Raises:
-        DatasetError: ``poses_ambiguous``, ``poses_malformed``, ``file_missing``, ``text_not_utf8``.
+        DatasetError: ``poses_ambiguous``, ``poses_malformed``, ``calibration_malformed``, ``file_missing``,
+            ``text_not_utf8``.
     """
+    T_cam_cam0 = read_odometry_shift(sequence, number)
     path = find_poses(sequence)
-    if path is None:
+    if T_cam_cam0 is None or path is None:
         return None
     poses = read_poses(path, timestamps_ns.size)
     return Trajectory(timestamps_ns, poses @ np.linalg.inv(T_cam_cam0), str(path))
@@ -110,9 +114,9 @@ def _axis_rotations(axis: int, angles_rad: Float64Array) -> Float64Array:
 
 
 def oxts_trajectory(
-    timestamps_ns: Int64Array, rows: Sequence[OxtsRow], T_cam_imu: Float64Array | None, origin: str
+    timestamps_ns: Int64Array, places: Float64Array, T_cam_imu: Float64Array | None, origin: str
 ) -> Trajectory | None:
-    """The camera's poses from OXTS records; None where the mounting is unknown.
+    """The camera's poses from the places [N, 6] of OXTS records; None where the mounting is unknown.
 
     Of duplicate and disordered stamps (``_extract``) only the records that are later than all before them stay.
     """
@@ -120,5 +124,5 @@ def oxts_trajectory(
         return None
     latest = np.maximum.accumulate(timestamps_ns)
     later = np.append(True, timestamps_ns[1:] > latest[:-1])
-    T_world_imu = oxts_poses(np.array([row.place for row in rows])[later])
+    T_world_imu = oxts_poses(places[later])
     return Trajectory(timestamps_ns[later], T_world_imu @ np.linalg.inv(T_cam_imu), origin)

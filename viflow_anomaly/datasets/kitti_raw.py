@@ -31,16 +31,17 @@ from viflow_anomaly.config import ImageLimits
 from viflow_anomaly.datasets.kitti_calibration import CalibrationFiles, read_raw_camera
 from viflow_anomaly.datasets.kitti_files import (
     SPEED_NAMES,
+    OxtsFolder,
     first_image_size,
     forward_speeds,
-    numbered_files,
+    image_files,
     oxts_imu,
-    read_oxts_folder,
+    oxts_places,
     read_stamps,
     stamp_of,
 )
 from viflow_anomaly.datasets.kitti_poses import oxts_trajectory
-from viflow_anomaly.datasets.recording import FileRecording
+from viflow_anomaly.datasets.recording import FileRecording, choose_camera
 from viflow_anomaly.datasets.tables import check_increasing
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.sensor_data import Int64Array
@@ -69,15 +70,9 @@ def open_kitti_raw(root: Path, *, camera: str | None, limits: ImageLimits) -> Fi
         DatasetError: ``camera_unknown``, ``no_frames``, ``timestamps_malformed``, ``timestamps_missing``,
             ``timestamps_not_increasing``, ``oxts_malformed``, ``file_name_malformed``, ``calibration_malformed``.
     """
-    chosen = camera or _cameras(root)[0]
-    if chosen not in _cameras(root):
-        raise DatasetError(
-            f"{root}: expected one of {', '.join(_cameras(root))}, found camera {chosen!r}", code="camera_unknown"
-        )
-    images = numbered_files(root / chosen / "data", (".png", ".jpg"))
-    if not images:
-        raise DatasetError(f"{root / chosen / 'data'}: expected at least one image, found none", code="no_frames")
-    imu_stamps, rows = read_oxts_folder(root / "oxts")
+    chosen = choose_camera(root, _cameras(root), camera)
+    images = image_files(root / chosen / "data")
+    imu_stamps, rows = OxtsFolder(root / "oxts").read()
     stamps = _frame_stamps(root, chosen, list(images), imu_stamps)
     files = CalibrationFiles.of_date(root.resolve().parent)
     calibration = read_raw_camera(files, chosen[-2:], first_image_size(images.values(), limits=limits))
@@ -87,13 +82,14 @@ def open_kitti_raw(root: Path, *, camera: str | None, limits: ImageLimits) -> Fi
         root=root,
         format="kitti_raw",
         camera=calibration,
+        camera_name=chosen,
         imu=oxts_imu(imu_stamps, rows),
         frame_timestamps_ns=stamps,
         frame_paths=tuple(images.values()),
         motor_commands=forward_speeds(stamps, imu_stamps, rows),
         motor_names=SPEED_NAMES,
         limits=limits,
-        read_trajectory=partial(oxts_trajectory, imu_stamps, rows, T_cam_imu, str(root / "oxts")),
+        read_trajectory=partial(oxts_trajectory, imu_stamps, oxts_places(rows), T_cam_imu, str(root / "oxts")),
     )
 
 

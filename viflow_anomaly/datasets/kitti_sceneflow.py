@@ -25,22 +25,29 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from viflow_anomaly.config import ImageLimits, MotionWindowConfig, MotorSource
-from viflow_anomaly.datasets.ground_truth_png import read_flow_png
+from viflow_anomaly.datasets.ground_truth_png import read_flow_png, read_instances_png
 from viflow_anomaly.datasets.kitti_calibration import CalibrationFiles, read_raw_camera
 from viflow_anomaly.datasets.kitti_drives import RawDrive, find_raw_data
-from viflow_anomaly.datasets.kitti_files import OxtsRow, forward_speeds, oxts_imu
+from viflow_anomaly.datasets.kitti_files import forward_speeds, oxts_imu, oxts_places
 from viflow_anomaly.datasets.kitti_poses import oxts_trajectory
 from viflow_anomaly.datasets.tables import read_text
 from viflow_anomaly.datasets.usable_pairs import Interval, window_fault
 from viflow_anomaly.errors import DatasetError, InvalidInputError
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.images import read_image
-from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples, Int64Array, PinholeCamera, Uint8Array
+from viflow_anomaly.sensor_data import (
+    Float64Array,
+    Frame,
+    FramePair,
+    ImuSamples,
+    Int64Array,
+    PinholeCamera,
+    Uint8Array,
+)
 
 PAPER_WINDOW = MotionWindowConfig(layout="paper_kitti", axes="sensor")
 BEFORE_NS, AFTER_NS = 120_000_000, 20_000_000
@@ -54,7 +61,8 @@ class _Usable(NamedTuple):
     interval: Interval
     imu: ImuSamples
     motor_command: NDArray[np.float64]
-    oxts: tuple[Int64Array, list[OxtsRow]]
+    oxts: tuple[Int64Array, Float64Array]
+    """Stamps [N] and places [N, 6]."""
 
 
 class KittiSceneFlow:
@@ -93,8 +101,10 @@ class KittiSceneFlow:
         self._pairs: list[_Usable] = []
         excluded: Counter[str] = Counter()
         raw_data = raw_data or find_raw_data(root.resolve())
-        for number, frame in _read_mapping(root, self._numbers()).items():
-            found = "no_raw_drive" if frame is None else _find(number, RawDrive(raw_data, frame[0]), frame[1], window)
+        mapping = _read_mapping(root, self._numbers())
+        drives = {frame[0]: RawDrive(raw_data, frame[0]) for frame in mapping.values() if frame is not None}
+        for number, frame in mapping.items():
+            found = "no_raw_drive" if frame is None else _find(number, drives[frame[0]], frame[1], window)
             if isinstance(found, _Usable):
                 self._pairs.append(found)
             else:
@@ -175,13 +185,7 @@ class KittiSceneFlow:
             IndexError: outside.
             DatasetError: ``ground_truth_missing``, ``ground_truth_malformed``.
         """
-        path = self._training / "obj_map" / f"{self.number(index):06d}_10.png"
-        if not path.is_file():
-            raise DatasetError(f"{path}: expected a map of objects, found none", code="ground_truth_missing")
-        image = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), cv2.IMREAD_UNCHANGED)
-        if image is None or image.ndim != 2 or image.dtype != np.uint8:
-            raise DatasetError(f"{path}: expected an 8-bit gray PNG, found another", code="ground_truth_malformed")
-        return np.asarray(image)
+        return read_instances_png(self._training / "obj_map" / f"{self.number(index):06d}_10.png")
 
     def _camera(self, found: _Usable, size: tuple[int, int]) -> PinholeCamera | None:
         """The pair's own calibration, each file that it lacks from the day of the drive."""
@@ -236,4 +240,4 @@ def _find(number: int, drive: RawDrive, frame: int, window: MotionWindowConfig) 
     if fault is not None:
         return fault
     speed = forward_speeds(np.array([interval.source_ns]), imu_stamps, rows)[0]
-    return _Usable(number, drive, interval, imu, speed, (imu_stamps, rows))
+    return _Usable(number, drive, interval, imu, speed, (imu_stamps, oxts_places(rows)))

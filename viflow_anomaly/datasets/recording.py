@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -37,6 +37,11 @@ class Recording(Protocol):
     @property
     def camera(self) -> PinholeCamera | None:
         """Calibration of the images as they are stored, or None when the recording has none."""
+        ...
+
+    @property
+    def camera_name(self) -> str | None:
+        """Which of its cameras this is (EuRoC ``cam0``, KITTI ``image_02``), or None where the layout has only one."""
         ...
 
     @property
@@ -96,6 +101,7 @@ class FileRecording:
         motor_names: M names of its columns; empty without.
         limits: on every image that is decoded.
         read_trajectory: reads the poses of the camera when they are first asked for; None: there are none.
+        camera_name: as in ``Recording``.
 
     Raises:
         DatasetError: ``no_frames``.
@@ -112,6 +118,7 @@ class FileRecording:
     motor_names: tuple[str, ...] = ()
     limits: ImageLimits = field(default_factory=ImageLimits)
     read_trajectory: Callable[[], Trajectory | None] | None = None
+    camera_name: str | None = None
 
     def __post_init__(self) -> None:
         if not self.frame_paths:
@@ -142,3 +149,22 @@ class FileRecording:
     @cached_property
     def trajectory(self) -> Trajectory | None:
         return None if self.read_trajectory is None else self.read_trajectory()
+
+
+def choose_camera(root: Path, cameras: Sequence[str], wanted: str | None) -> str:
+    """The wanted camera, else the first.
+
+    Args:
+        root: the recording, for the message.
+        cameras: those that it has, at least one.
+        wanted: a name, or None.
+
+    Raises:
+        DatasetError: ``camera_unknown``.
+    """
+    chosen = wanted or cameras[0]
+    if chosen not in cameras:
+        raise DatasetError(
+            f"{root}: expected one of {', '.join(cameras)}, found camera {chosen!r}", code="camera_unknown"
+        )
+    return chosen

@@ -10,15 +10,17 @@ from __future__ import annotations
 import csv
 import itertools
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Self
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
+from viflow_anomaly.datasets import euroc
 from viflow_anomaly.datasets.camera_json import camera_from_mapping
 from viflow_anomaly.datasets.ground_truth_png import (
     read_depth_png,
@@ -28,11 +30,13 @@ from viflow_anomaly.datasets.ground_truth_png import (
 )
 from viflow_anomaly.errors import DatasetError, InvalidInputError
 from viflow_anomaly.geometry import occluded_pixels, rigid_motion_flow
-from viflow_anomaly.sensor_data import Float64Array, PinholeCamera, Uint8Array
+from viflow_anomaly.sensor_data import Float64Array, Int64Array, PinholeCamera, Uint8Array
 
 Float32Array = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 
+FOLDER_NAME = "groundtruth0"
+SIMULATED_CAMERA = "cam0"
 RECORD_NAME = "ground_truth.json"
 POSES_NAME = "poses.csv"
 OBJECT_COLUMNS = (
@@ -62,97 +66,112 @@ class MovingObject:
     independent_flow_px: float
 
 
-def _rotation(quaternion_wxyz: Float64Array) -> Float64Array:
-    w, x, y, z = quaternion_wxyz / np.linalg.norm(quaternion_wxyz)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+def ground_truth_folder(root: Path) -> Path | None:
+    """``mav0/groundtruth0`` in a folder, else ``groundtruth0``; None without either."""
+    places = (root / "mav0" / FOLDER_NAME, root / FOLDER_NAME)
+    return next((place for place in places if place.is_dir()), None)
 
 
 class SimulatedGroundTruth:
     """Ground truth of one sequence: simulated, or rendered for a recording.
 
     Args:
-        root: the sequence, its ``mav0`` folder, or anything ``find`` accepts: a folder that holds ``groundtruth0``.
+        root: the sequence, its ``mav0`` folder, or what else ``ground_truth_folder`` accepts.
 
     Raises:
         DatasetError: ``ground_truth_missing`` when there is none.
     """
 
     def __init__(self, root: Path) -> None:
-        mav0 = root / "mav0" if (root / "mav0").is_dir() else root
-        self.folder = mav0 / "groundtruth0"
-        self._mav0 = mav0
-        if not self.folder.is_dir():
+        folder = ground_truth_folder(root)
+        if folder is None:
             raise DatasetError(
                 f"{root}: expected groundtruth0 or mav0/groundtruth0, found none", code="ground_truth_missing"
             )
-        self._is_rendered = (self.folder / RECORD_NAME).is_file()
+        self.folder = folder
+        self.is_rendered = (folder / RECORD_NAME).is_file()
+        """For a recording, whose record it has then; else it is a simulated sequence's."""
 
     @classmethod
     def find(cls, root: Path) -> Self | None:
         """The ground truth beside a sequence (its root or its ``mav0``), or None."""
-        places = (root / "mav0" / "groundtruth0", root / "groundtruth0")
-        return cls(root) if any(place.is_dir() for place in places) else None
+        return None if ground_truth_folder(root) is None else cls(root)
 
     @cached_property
     def camera(self) -> PinholeCamera:
-        """Intrinsics and distortion of the images that depth and flow belong to."""
-        return self._calibration[0]
+        """Intrinsics and distortion of the images that depth and flow belong to.
 
-    @cached_property
-    def _calibration(self) -> tuple[PinholeCamera, Float64Array]:
-        if self._is_rendered:
-            return _recorded_camera(self.folder / RECORD_NAME), np.eye(4)
-        path = self._mav0 / "cam0" / "sensor.yaml"
-        try:
-            sensor = yaml.safe_load(path.read_text(encoding="utf-8"))
-            fx, fy, cx, cy = (float(value) for value in sensor["intrinsics"])
-            width, height = (int(value) for value in sensor["resolution"])
-            T_body_cam = np.array(sensor["T_BS"]["data"], dtype=np.float64).reshape(4, 4)
-            camera = PinholeCamera(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
-        except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, InvalidInputError) as err:
+        Raises:
+            DatasetError: ``ground_truth_missing``, ``ground_truth_malformed``.
+        """
+        if self.is_rendered:
+            return self._record[0]
+        sensors = [self.folder.with_name(name) / "sensor.yaml" for name in (SIMULATED_CAMERA, "imu0")]
+        with _as_ground_truth():
+            camera = euroc.read_camera(*sensors)
+        if camera is None:
             raise DatasetError(
-                f"{path}: expected intrinsics, resolution and T_BS, found {err!r}", code="ground_truth_malformed"
-            ) from err
-        return camera, T_body_cam
+                f"{sensors[0]}: expected the simulated camera's calibration, found no such file",
+                code="ground_truth_malformed",
+            )
+        return camera
 
     @cached_property
-    def _states(self) -> tuple[NDArray[np.int64], Float64Array]:
-        """Stamps [N] and rows [N, 7]: position, quaternion w x y z."""
-        path = self._mav0 / "state_groundtruth_estimate0" / "data.csv"
-        if self._is_rendered:
-            path = self.folder / POSES_NAME
-        stamps, rows = [], []
-        for number, row in _csv_rows(path):
-            try:
-                stamp, state = _state_of(row)
-            except ValueError as err:
-                raise _malformed(path, number, "a stamp, a position and a quaternion", row) from err
-            stamps.append(stamp)
-            rows.append(state)
-        return np.array(stamps, dtype=np.int64), np.array(rows, dtype=np.float64).reshape(-1, 7)
+    def camera_name(self) -> str | None:
+        """As ``Recording.camera_name``; None also where an older record does not say.
+
+        Raises:
+            DatasetError: ``ground_truth_malformed``.
+        """
+        return self._record[1] if self.is_rendered else SIMULATED_CAMERA
+
+    @cached_property
+    def _record(self) -> tuple[PinholeCamera, str | None]:
+        path = self.folder / RECORD_NAME
+        try:
+            return _parse_record(path.read_bytes())
+        except (OSError, ValueError, KeyError, TypeError, RecursionError, InvalidInputError) as err:
+            raise DatasetError(
+                f"{path}: expected the record of rendered ground truth with its camera, found {err!r:.200}",
+                code="ground_truth_malformed",
+            ) from err
+
+    @cached_property
+    def has_instances(self) -> bool:
+        """Whether movers are known: ``instances`` is there. Rendered ground truth knows of none."""
+        return any((self.folder / "instances").glob("*.png"))
+
+    @cached_property
+    def _poses(self) -> tuple[Int64Array, Float64Array]:
+        """Stamps [N] in the camera's clock, T_world_cam [N, 4, 4]."""
+        if self.is_rendered:
+            with _as_ground_truth():
+                return euroc.read_body_poses(self.folder / POSES_NAME)
+        states = self.folder.with_name("state_groundtruth_estimate0") / "data.csv"
+        with _as_ground_truth():
+            trajectory = euroc.read_trajectory(states, self.folder.with_name(SIMULATED_CAMERA) / "sensor.yaml")
+        if trajectory is None:
+            raise DatasetError(
+                f"{states}: expected the simulated states, and {SIMULATED_CAMERA}/sensor.yaml beside them, found not "
+                "both",
+                code="ground_truth_missing",
+            )
+        return trajectory.timestamps_ns, trajectory.T_world_cam
 
     def camera_pose(self, timestamp_ns: int) -> Float64Array:
         """T_world_cam [4, 4] at a frame's stamp.
 
         Raises:
-            DatasetError: ``ground_truth_missing`` when the stamp is not in the state ground truth.
+            DatasetError: ``ground_truth_missing`` when there is no pose of that very stamp; ``ground_truth_malformed``.
         """
-        stamps, rows = self._states
+        stamps, poses = self._poses
         index = int(np.searchsorted(stamps, timestamp_ns))
         if index == len(stamps) or stamps[index] != timestamp_ns:
             raise DatasetError(
                 f"{self.folder}: expected a ground-truth pose at {timestamp_ns}, found none",
                 code="ground_truth_missing",
             )
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = _rotation(rows[index, 3:]), rows[index, :3]
-        return np.asarray(pose @ self._calibration[1])
+        return np.array(poses[index])
 
     def depth(self, source_ns: int) -> Float32Array:
         """[H, W] metres, inf where nothing was hit (simulated) or nothing is known (rendered for a recording)."""
@@ -172,7 +191,7 @@ class SimulatedGroundTruth:
             return read_flow_png(stored)
         depth = self.depth(source_ns)
         flow, valid = rigid_motion_flow(self.camera, depth, self._motion(source_ns, target_ns))
-        if not self._is_rendered:
+        if not self.is_rendered:
             return flow, valid
         known = valid & np.isfinite(depth)
         return np.where(known[..., None], flow, np.float32(0)), known
@@ -203,7 +222,7 @@ class SimulatedGroundTruth:
     @cached_property
     def _next_stamps(self) -> dict[int, int]:
         # Rendered ground truth may lack depth for some frames; every frame that has a pose is in its poses.
-        stamps = self._states[0].tolist() if self._is_rendered else self.source_stamps
+        stamps = self._poses[0].tolist() if self.is_rendered else self.source_stamps
         return dict(itertools.pairwise(stamps))
 
     def flow(self, source_ns: int) -> tuple[Float32Array, BoolArray]:
@@ -231,20 +250,22 @@ class SimulatedGroundTruth:
         return found
 
 
-def _recorded_camera(path: Path) -> PinholeCamera:
+@contextmanager
+def _as_ground_truth() -> Iterator[None]:
+    """What the recordings' readers refuse is ground truth that is missing or malformed here."""
     try:
-        return camera_from_mapping(json.loads(path.read_bytes())["camera"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, InvalidInputError) as err:
-        raise DatasetError(
-            f"{path}: expected the record of rendered ground truth with its camera, found {err!r:.200}",
-            code="ground_truth_malformed",
-        ) from err
+        yield
+    except DatasetError as err:
+        code = "ground_truth_missing" if err.code == "file_missing" else "ground_truth_malformed"
+        raise DatasetError(err.message, code=code) from err
 
 
-def _state_of(row: list[str]) -> tuple[int, list[float]]:
-    if len(row) < 8:
-        raise ValueError(f"{len(row)} columns")
-    return int(row[0]), [float(value) for value in row[1:8]]
+def _parse_record(text: bytes) -> tuple[PinholeCamera, str | None]:
+    record = json.loads(text)
+    camera, name = camera_from_mapping(record["camera"]), record.get("camera_name")
+    if not isinstance(name, str | None):
+        raise TypeError(f"camera_name {name!r:.40}")
+    return camera, name
 
 
 def _object_of(row: list[str]) -> MovingObject:

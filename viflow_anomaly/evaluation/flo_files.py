@@ -6,6 +6,7 @@ component beyond 1e9 marks a pixel without an estimate (vision.middlebury.edu/fl
 
 from __future__ import annotations
 
+import io
 import struct
 from pathlib import Path
 
@@ -22,6 +23,30 @@ UNKNOWN_PX = 1e9
 STORED_UNKNOWN_PX = np.float32(1e10)
 
 
+def read_flo_size(path: Path) -> tuple[int, int]:
+    """(width, height) from the header, once the file is found to be as long as they say; no flow is read.
+
+    Raises:
+        DatasetError: as ``read_flo``.
+    """
+    try:
+        with path.open("rb") as file:
+            head, length = file.read(HEADER.size), file.seek(0, io.SEEK_END)
+    except OSError as err:
+        raise DatasetError(
+            f"{path}: expected a .flo file, cannot read it: {err.strerror}", code="flow_file_missing"
+        ) from err
+    if len(head) < HEADER.size or head[:4] != MAGIC:
+        raise _malformed(path, f"the bytes {MAGIC!r}, a width and a height", f"{head!r}")
+    _, width, height = HEADER.unpack(head)
+    if width < 1 or height < 1:
+        raise _malformed(path, "a positive width and height", f"{width}x{height}")
+    expected = HEADER.size + 8 * width * height
+    if length != expected:
+        raise _malformed(path, f"{expected} bytes for {width}x{height} px", f"{length}")
+    return width, height
+
+
 def read_flo(path: Path) -> Float32Array:
     """Flow [H, W, 2] float32 in px, NaN where the file has no estimate.
 
@@ -29,21 +54,9 @@ def read_flo(path: Path) -> Float32Array:
         DatasetError: ``flow_file_missing``; ``flow_file_malformed`` for another magic number, a size that is not
             positive, or a length that is not the size's.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as err:
-        raise DatasetError(
-            f"{path}: expected a .flo file, cannot read it: {err.strerror}", code="flow_file_missing"
-        ) from err
-    if len(data) < HEADER.size or data[:4] != MAGIC:
-        raise _malformed(path, f"the bytes {MAGIC!r}, a width and a height", f"{data[:12]!r}")
-    _, width, height = HEADER.unpack_from(data)
-    if width < 1 or height < 1:
-        raise _malformed(path, "a positive width and height", f"{width}x{height}")
-    expected = HEADER.size + 8 * width * height
-    if len(data) != expected:
-        raise _malformed(path, f"{expected} bytes for {width}x{height} px", f"{len(data)}")
-    flow = np.frombuffer(data, dtype="<f4", offset=HEADER.size).reshape(height, width, 2).astype(np.float32)
+    width, height = read_flo_size(path)
+    flow = np.fromfile(path, dtype="<f4", offset=HEADER.size, count=2 * width * height)
+    flow = flow.reshape(height, width, 2).astype(np.float32)
     unknown = ~(np.abs(flow) <= UNKNOWN_PX).all(axis=-1)
     flow[unknown] = np.nan
     return flow

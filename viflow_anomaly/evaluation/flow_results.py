@@ -10,16 +10,16 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 
 from viflow_anomaly.config import MotorSource
 from viflow_anomaly.datasets.ground_truth_png import read_flow_png
 from viflow_anomaly.errors import DatasetError
-from viflow_anomaly.evaluation.flo_files import read_flo
+from viflow_anomaly.evaluation.flo_files import read_flo, read_flo_size
 from viflow_anomaly.evaluation.flow_methods import MethodAbout, NoEstimateError
 from viflow_anomaly.evaluation.flow_truth import PairName
 from viflow_anomaly.geometry import Float32Array
@@ -27,6 +27,9 @@ from viflow_anomaly.sensor_data import FramePair
 
 SUFFIXES = (".flo", ".png", ".npy")
 NO_FILE = "no_file"
+NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+# NumPy reads a header as Python source: whatever that can fail with.
+NPY_FAULTS = (OSError, ValueError, TypeError, EOFError, SyntaxError, TokenError, MemoryError, RecursionError)
 
 
 class ResultFiles:
@@ -74,11 +77,8 @@ class ResultFiles:
                 code="results_ambiguous",
                 field="results",
             )
-        flow = _read(found[0])
-        expected = (*pair.source.image.shape, 2)
-        if flow.shape != expected:
-            raise _malformed(found[0], f"flow of shape {expected}, as the image", f"{flow.shape}")
-        return flow
+        height, width = pair.source.image.shape
+        return _read(found[0], (height, width, 2))
 
     def _candidates(self, name: PairName) -> list[Path]:
         for stem in self._stems(name):
@@ -95,19 +95,40 @@ class ResultFiles:
         return [folder / stem for folder in folders for stem in stems]
 
 
-def _read(path: Path) -> Float32Array:
+def _read(path: Path, shape: tuple[int, int, int]) -> Float32Array:
+    """The flow, if it is of the image's shape; what says so in its header is not read where it is of another."""
     if path.suffix == ".flo":
+        width, height = read_flo_size(path)
+        _require_shape(path, (height, width, 2), shape)
         return read_flo(path)
     if path.suffix == ".png":
         flow, valid = read_flow_png(path)
+        _require_shape(path, flow.shape, shape)
         return np.where(valid[..., None], flow, np.float32(np.nan))
+    return _read_npy(path, shape)
+
+
+def _read_npy(path: Path, shape: tuple[int, int, int]) -> Float32Array:
     try:
-        array = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
-    except (OSError, ValueError, EOFError) as err:
+        with path.open("rb") as file:
+            version = np.lib.format.read_magic(file)
+            read_header = NPY_HEADERS.get(version)
+            if read_header is None:
+                raise _malformed(path, "an array of floats in NumPy's format 1.0 or 2.0", f"format {version}")
+            found, _, dtype = read_header(file)
+            if not np.issubdtype(dtype, np.floating):
+                raise _malformed(path, "an array of floats", str(dtype))
+            _require_shape(path, found, shape)
+            file.seek(0)
+            array = np.lib.format.read_array(file, allow_pickle=False)
+    except NPY_FAULTS as err:
         raise _malformed(path, "an array of floats in NumPy's format", str(err)) from err
-    if not isinstance(array, np.ndarray) or not np.issubdtype(array.dtype, np.floating):
-        raise _malformed(path, "an array of floats", str(getattr(array, "dtype", type(array).__name__)))
     return np.asarray(array, dtype=np.float32)
+
+
+def _require_shape(path: Path, found: tuple[int, ...], expected: tuple[int, ...]) -> None:
+    if found != expected:
+        raise _malformed(path, f"flow of shape {expected}, as the image", f"{found}")
 
 
 def _malformed(path: Path, expected: str, found: str) -> DatasetError:

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viflow_anomaly.config import MotorSource, SplitConfig
+from viflow_anomaly.datasets.camera_json import camera_to_mapping
 from viflow_anomaly.datasets.pairing import RecordingPairs
+from viflow_anomaly.datasets.recording import Recording
 from viflow_anomaly.datasets.registry import open_recording
 from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
 from viflow_anomaly.datasets.splits import split_pairs
@@ -81,7 +83,9 @@ class RecordingTruth:
             method is wrong for seeing it; needs ``groundtruth0/instances``.
 
     Raises:
-        DatasetError: ``ground_truth_missing`` without ground truth or pairs; as ``open_recording``.
+        DatasetError: ``ground_truth_missing`` without ground truth or pairs; ``ground_truth_camera_differs`` where it
+            was rendered for another camera than the recording's; ``ground_truth_no_movers`` without ``movers`` where
+            ground truth does not say which pixels those are; ``ground_truth_malformed``; as ``open_recording``.
         InvalidInputError: as ``RecordingPairs``.
     """
 
@@ -105,6 +109,15 @@ class RecordingTruth:
                 f"{place}: expected a recording with ground truth (groundtruth0) and two frames, found {found}",
                 code="ground_truth_missing",
                 field="validation",
+            )
+        if truth.is_rendered:
+            _require_same_camera(truth, self.recording)
+        if not movers and not truth.has_instances:
+            raise DatasetError(
+                f"{truth.folder}: expected instances/, which say what moves, to leave movers out, found none (ground "
+                "truth that is rendered for a recording knows of no movers)",
+                code="ground_truth_no_movers",
+                field="movers",
             )
         self.ground_truth = truth
         self._pairs_by_source: dict[MotorSource | None, RecordingPairs] = {None: self.pairs}
@@ -130,6 +143,30 @@ class RecordingTruth:
         stamps = self.pairs.stamps(index)
         flow, valid = self.ground_truth.static_flow(*stamps)
         return TrueFlow(flow, valid if self._movers else valid & (self.ground_truth.instances(stamps[0]) == 0))
+
+
+def _require_same_camera(truth: SimulatedGroundTruth, recording: Recording) -> None:
+    """Two cameras of a rig have the same stamps, and often the same size: nothing else would tell."""
+    known = camera_to_mapping(truth.camera) | {"name": truth.camera_name}
+    found: dict[str, object] = {} if recording.camera is None else camera_to_mapping(recording.camera)
+    found["name"] = recording.camera_name
+    both = [key for key in known if known[key] is not None and found.get(key) is not None]
+    wrong = next((key for key in both if not _same(known[key], found[key])), None)
+    if wrong is not None:
+        raise DatasetError(
+            f"{truth.folder}: expected ground truth of the camera of {recording.root}, whose {wrong} is "
+            f"{found[wrong]!r:.120}, found ground truth of one whose {wrong} is {known[wrong]!r:.120}",
+            code="ground_truth_camera_differs",
+            field="ground_truth",
+        )
+
+
+def _same(one: object, other: object) -> bool:
+    """Equal but for the last digits, which differ from machine to machine in a product of matrices."""
+    if isinstance(one, str) or isinstance(other, str):
+        return one == other
+    first, second = np.asarray(one), np.asarray(other)
+    return first.shape == second.shape and bool(np.allclose(first, second, rtol=1e-9, atol=1e-9))
 
 
 class TestPart:

@@ -21,7 +21,7 @@ from viflow_anomaly.datasets.recording import FileRecording
 from viflow_anomaly.datasets.registry import open_recording
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.geometry import occluded_pixels, rigid_motion_flow
-from viflow_anomaly.ground_truth.frame_poses import poses_of_frames, read_trajectory_file
+from viflow_anomaly.ground_truth.frame_poses import POSE_RULE, poses_of_frames, read_trajectory_file
 from viflow_anomaly.ground_truth.ply import read_ply_points
 from viflow_anomaly.ground_truth.point_cloud import PointCloud, make_point_cloud
 from viflow_anomaly.ground_truth.range_image import render_depth
@@ -80,7 +80,7 @@ def render_room(
     points = read_ply_points(cloud_file)
     T_world_cloud = euroc.read_cloud_pose(cloud_file.with_name("sensor.yaml"))
     record = {
-        **record_head(recording.name, lens),
+        **record_head(recording, lens),
         "made_from": {
             "cloud": {**fingerprint(cloud_file), "points": len(points), "T_world_cloud": T_world_cloud.tolist()},
             "trajectory": "the recording's" if trajectory is None else fingerprint(trajectory),
@@ -94,7 +94,7 @@ def render_room(
 def _poses(recording: FileRecording, trajectory: Path | None, stamps: list[int]) -> dict[int, Float64Array]:
     source = recording.trajectory
     if trajectory is not None:
-        source = read_trajectory_file(trajectory, recording.frame_path(0).parent.parent / "sensor.yaml")
+        source = read_trajectory_file(trajectory, recording.root / str(recording.camera_name) / "sensor.yaml")
     if source is None:
         raise DatasetError(
             f"{recording.root}: expected state_groundtruth_estimate0/data.csv or a file of poses (--trajectory), "
@@ -104,8 +104,9 @@ def _poses(recording: FileRecording, trajectory: Path | None, stamps: list[int])
     poses = poses_of_frames(source, stamps)
     if not poses:
         raise DatasetError(
-            f"{source.origin}: expected poses within 1 ms of the frames from {stamps[0]} to {stamps[-1]}, found poses "
-            f"from {source.timestamps_ns[0]} to {source.timestamps_ns[-1]} and none so close",
+            f"{source.origin}: expected poses for the frames from {stamps[0]} to {stamps[-1]} ({POSE_RULE}), found "
+            f"poses from {source.timestamps_ns[0]} to {source.timestamps_ns[-1]}, in the camera's clock, and none so "
+            "close",
             code="trajectory_not_covering",
         )
     return poses
@@ -144,13 +145,13 @@ def _render_frames(
     for done, (source, target) in enumerate(itertools.pairwise([*stamps, None]), start=1):
         assert source is not None
         if source in renderer.poses:
-            with_flow += target in renderer.poses
-            if folder.has(source):
+            if folder.has(source, flow=target in renderer.poses):
                 kept += 1
             else:
                 truth = renderer.truth(source, target)
                 folder.write(source, truth)
                 shares.append(float(np.isfinite(truth.depth_m).mean()))
+            with_flow += folder.has_flow(source)
         if on_progress is not None:
             on_progress(done, len(stamps))
     return RoomSummary(

@@ -21,14 +21,21 @@ from numpy.typing import NDArray
 
 from viflow_anomaly.config import ImageLimits
 from viflow_anomaly.datasets.kitti_files import numbered_files, read_calibration
-from viflow_anomaly.datasets.kitti_labels import LABELLED_CAMERA, Box, label_scale
+from viflow_anomaly.datasets.kitti_labels import LABELLED_CAMERA, Box, label_files, label_scale
 from viflow_anomaly.datasets.recording import FileRecording
 from viflow_anomaly.datasets.registry import open_recording
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.geometry import project_rays, rigid_motion_flow
 from viflow_anomaly.ground_truth.kitti_boxes import read_doubtful_boxes
 from viflow_anomaly.ground_truth.range_image import MARGIN_PX, NEAREST_M, ImagePoints, front_depth, points_in_image
-from viflow_anomaly.ground_truth.truth_folder import FrameTruth, TruthFolder, record_head, require_camera
+from viflow_anomaly.ground_truth.truth_folder import (
+    FrameTruth,
+    TruthFolder,
+    fingerprint_of_files,
+    fingerprint_of_sizes,
+    record_head,
+    require_camera,
+)
 from viflow_anomaly.sensor_data import Float64Array, PinholeCamera
 
 Float32Array = NDArray[np.float32]
@@ -92,24 +99,30 @@ def render_lidar(
     poses = _poses(recording)
     stamps = recording.frame_timestamps_ns.tolist()
     scans = [scan for scan in _scans(recording) if stamps[scan[0]] in poses]
-    labelled = recording.frame_path(0).parent.parent.name == LABELLED_CAMERA
+    labelled = recording.camera_name == LABELLED_CAMERA
     boxes = read_doubtful_boxes(recording.root) if labelled else {}
-    record = {**record_head(recording.name, lens), "made_from": {"scans": "velodyne_points", "labels": bool(boxes)}}
-    folder = TruthFolder(out or recording.root, record, poses, overwrite=overwrite)
     scale = label_scale(recording.root, lens.width, lens.height)
+    made_from = {
+        "scans": fingerprint_of_sizes(scan for _, _, scan in scans),
+        "T_cam_velo": T_cam_velo.tolist(),
+        "labels": fingerprint_of_files(label_files(recording.root)) if labelled else None,
+        "label_scale": scale,
+    }
+    record = {**record_head(recording, lens), "made_from": made_from}
+    folder = TruthFolder(out or recording.root, record, poses, overwrite=overwrite)
     counts = np.zeros(3, dtype=np.int64)
     kept = with_flow = without_labels = 0
     for done, (index, number, scan) in enumerate(scans, start=1):
         target = stamps[index + 1] if index + 1 < len(stamps) and stamps[index + 1] in poses else None
-        with_flow += target is not None
         without_labels += number not in boxes
-        if folder.has(stamps[index]):
+        if folder.has(stamps[index], flow=target is not None):
             kept += 1
         else:
             points = _points_in_camera(lens, read_scan(scan), T_cam_velo)
             depth, some = sparse_depth(lens, points, boxes.get(number, []), scale)
             counts += some
             folder.write(stamps[index], _frame_truth(lens, depth, poses, stamps[index], target))
+        with_flow += folder.has_flow(stamps[index])
         if on_progress is not None:
             on_progress(done, len(scans))
     return LidarSummary(

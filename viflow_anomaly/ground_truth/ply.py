@@ -19,6 +19,7 @@ from __future__ import annotations
 import io
 import warnings
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -30,7 +31,9 @@ from viflow_anomaly.errors import DatasetError, TooLargeError
 Float32Array = NDArray[np.float32]
 
 MAX_HEADER_BYTES = 65536
+MAX_LINE_BYTES = 65536
 MAX_POINTS = 100_000_000
+BLOCK_BYTES = 16 * 1024 * 1024
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 SCALARS = {
     "char": "i1",
@@ -154,29 +157,51 @@ def _read_binary(path: Path, file: BinaryIO, elements: list[_Element], order: st
         whole = max(0, size - start) // dtype.itemsize
         raise _malformed(path, f"expected {vertex.count} points, found a file that ends after {whole}")
     file.seek(start)
-    rows = np.fromfile(file, dtype, count=vertex.count)
-    return np.stack([rows[axis].astype(np.float32) for axis in AXES], axis=-1)
+    points = np.empty((vertex.count, 3), np.float32)
+    block = max(1, BLOCK_BYTES // dtype.itemsize)  # rows may have thousands of properties, of which three are wanted
+    for first in range(0, vertex.count, block):
+        rows = np.fromfile(file, dtype, count=min(block, vertex.count - first))
+        for column, axis in enumerate(AXES):
+            points[first : first + len(rows), column] = rows[axis]
+    return points
 
 
 def _read_ascii(path: Path, file: BinaryIO, elements: list[_Element]) -> Float32Array:
     *before, vertex = elements
     names = list(vertex.properties)
     for _ in range(sum(element.count for element in before)):
-        if not file.readline():
+        if not _line(path, file):
             break
+    data = _bytes_left(file)
+    if data < vertex.count * 2 * len(names) - 1:  # a digit and what separates it, for every number; NumPy allocates all
+        raise _malformed(path, f"expected {vertex.count} lines of {' '.join(names)}, found only {data} bytes of data")
     columns = [names.index(axis) for axis in AXES]
     if not vertex.count:
         return np.empty((0, 3), np.float32)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # numpy warns where the data end early; the count below says so better
         try:
-            lines = (line.decode("ascii") for line in file)
+            lines = (line.decode("ascii") for line in iter(partial(_line, path, file), b""))
             points = np.loadtxt(lines, dtype=np.float32, usecols=columns, max_rows=vertex.count, comments=None, ndmin=2)
         except ValueError as err:
             raise _malformed(path, f"expected {vertex.count} lines of {' '.join(names)}, found {err}") from err
     if len(points) != vertex.count:
         raise _malformed(path, f"expected {vertex.count} points, found a file that ends after {len(points)}")
     return points
+
+
+def _line(path: Path, file: BinaryIO) -> bytes:
+    line = file.readline(MAX_LINE_BYTES)
+    if len(line) == MAX_LINE_BYTES:
+        raise _malformed(path, f"expected lines of less than {MAX_LINE_BYTES} bytes, found a longer one")
+    return line
+
+
+def _bytes_left(file: BinaryIO) -> int:
+    here = file.tell()
+    end = file.seek(0, io.SEEK_END)
+    file.seek(here)
+    return end - here
 
 
 def _malformed(path: Path, problem: str) -> DatasetError:
