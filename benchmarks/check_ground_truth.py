@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
+from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
 from viflow_anomaly.datasets.registry import open_recording
-from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
 from viflow_anomaly.ground_truth.picture_check import check_pair
 
 
@@ -28,7 +28,7 @@ def main() -> None:
     parser.add_argument("truth", type=Path)
     parser.add_argument("--pairs", type=int, default=50, help="evenly spread (default 50)")
     arguments = parser.parse_args()
-    recording, truth = open_recording(arguments.recording), SimulatedGroundTruth(arguments.truth)
+    recording, truth = open_recording(arguments.recording), GroundTruthFolder(arguments.truth)
     known = np.isin(recording.frame_timestamps_ns[:-1], truth.source_stamps)
     stored = [
         index

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from worlds import World, make_world, write_euroc
 
+from viflow_anomaly.datasets.ground_truth_folder import OBJECT_COLUMNS
 from viflow_anomaly.datasets.ground_truth_png import (
     read_depth_png,
     write_depth_png,
     write_flow_png,
     write_instances_png,
 )
-from viflow_anomaly.datasets.simulated_ground_truth import OBJECT_COLUMNS
 
 
 def add_ground_truth(

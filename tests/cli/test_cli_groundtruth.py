@@ -13,7 +13,7 @@ from pair_world import Ask
 from room import camera_pose, sample_room, write_room_recording
 from worlds import EUROC, write_plain
 
-from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
+from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
 
 CAMERA = EUROC.scaled_to(94, 60)
 
@@ -43,7 +43,7 @@ def test_euroc_json(ask: Ask, room: Path, tmp_path: Path) -> None:
         "with_flow": 1,
     }
     assert not (room / "mav0" / "groundtruth0").exists()
-    assert len(SimulatedGroundTruth(tmp_path / "truth").source_stamps) == 2
+    assert len(GroundTruthFolder(tmp_path / "truth").source_stamps) == 2
 
 
 def test_euroc_in_words_and_again(ask: Ask, room: Path) -> None:

@@ -8,9 +8,9 @@ import pytest
 from simulated_truth import add_ground_truth, add_movers
 from worlds import REAL_DATA, car_world, make_world, write_euroc, write_kitti_raw, write_lines
 
+from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
 from viflow_anomaly.datasets.kitti_labels import MOTION_COLUMNS, MOTION_FILE
 from viflow_anomaly.datasets.registry import open_recording
-from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.evaluation.labelled_pairs import (
     KittiPairs,
@@ -25,7 +25,7 @@ from viflow_anomaly.regions import BoundingBox
 
 def test_labels_come_from_the_ground_truth(tmp_path: Path) -> None:
     folder = add_movers(add_ground_truth(tmp_path / "drone_1", make_world(frames=3)))
-    truth = SimulatedGroundTruth.find(folder)
+    truth = GroundTruthFolder.find(folder)
     assert truth is not None
     labels = labels_of(truth, int(open_recording(folder).frame_timestamps_ns[0]))
     assert labels.objects == (

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from room import camera_pose, room_depth, room_flow, sample_room, write_ply, write_room_recording, write_states
 from worlds import EUROC, START_NS
 
-from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
+from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.evaluation.flow_truth import RecordingTruth
 from viflow_anomaly.ground_truth.euroc_room import RoomSummary, render_room
@@ -30,10 +30,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def rendered(made: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[RoomSummary, SimulatedGroundTruth]:
+def rendered(made: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[RoomSummary, GroundTruthFolder]:
     out = tmp_path_factory.mktemp("truth")
     summary = render_room(made, out=out)
-    return summary, SimulatedGroundTruth(out)
+    return summary, GroundTruthFolder(out)
 
 
 @pytest.fixture
@@ -47,14 +47,14 @@ def recording(made: Path, tmp_path: Path) -> Path:
     return folder
 
 
-def errors(truth: SimulatedGroundTruth, source: int, target: int) -> NDArray[np.float64]:
+def errors(truth: GroundTruthFolder, source: int, target: int) -> NDArray[np.float64]:
     flow, valid = truth.static_flow(STAMPS[source], STAMPS[target])
     exact, _ = room_flow(CAMERA, POSES[source], POSES[target])
     assert valid.mean() > 0.99
     return np.asarray(np.linalg.norm(flow - exact, axis=-1)[valid])
 
 
-def test_what_was_done_is_said(rendered: tuple[RoomSummary, SimulatedGroundTruth]) -> None:
+def test_what_was_done_is_said(rendered: tuple[RoomSummary, GroundTruthFolder]) -> None:
     summary, truth = rendered
     assert (summary.frames, summary.rendered, summary.kept, summary.without_pose, summary.with_flow) == (5, 5, 0, 0, 4)
     assert summary.known_share == pytest.approx(1.0, abs=0.01)
@@ -64,7 +64,7 @@ def test_what_was_done_is_said(rendered: tuple[RoomSummary, SimulatedGroundTruth
 
 
 @pytest.mark.parametrize("source", range(4))
-def test_flow_to_the_next_frame_is_exact(rendered: tuple[RoomSummary, SimulatedGroundTruth], source: int) -> None:
+def test_flow_to_the_next_frame_is_exact(rendered: tuple[RoomSummary, GroundTruthFolder], source: int) -> None:
     """Closed form by another path: world coordinates and OpenCV's projection. It also tells the direction of time."""
     error = errors(rendered[1], source, source + 1)
     assert np.median(error) < 0.02
@@ -76,7 +76,7 @@ def test_flow_to_the_next_frame_is_exact(rendered: tuple[RoomSummary, SimulatedG
 
 @pytest.mark.parametrize(("source", "target"), [(0, 2), (0, 3), (0, 4), (4, 0), (2, 1)])
 def test_flow_between_any_two_frames_is_exact(
-    rendered: tuple[RoomSummary, SimulatedGroundTruth], source: int, target: int
+    rendered: tuple[RoomSummary, GroundTruthFolder], source: int, target: int
 ) -> None:
     error = errors(rendered[1], source, target)
     assert np.median(error) < 0.05
@@ -85,7 +85,7 @@ def test_flow_between_any_two_frames_is_exact(
 
 @pytest.mark.parametrize(("source", "target"), [(0, 1), (0, 4), (3, 1)])
 def test_occluded_is_what_the_pillar_hides(
-    rendered: tuple[RoomSummary, SimulatedGroundTruth], source: int, target: int
+    rendered: tuple[RoomSummary, GroundTruthFolder], source: int, target: int
 ) -> None:
     flow, there = room_flow(CAMERA, POSES[source], POSES[target])
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
@@ -103,7 +103,7 @@ def test_occluded_is_what_the_pillar_hides(
     assert not found[outside].any()
 
 
-def test_the_folder_stands_alone(rendered: tuple[RoomSummary, SimulatedGroundTruth]) -> None:
+def test_the_folder_stands_alone(rendered: tuple[RoomSummary, GroundTruthFolder]) -> None:
     """Camera and poses are in it: the recording need not be there."""
     truth = rendered[1]
     assert truth.camera.distortion_model == "radtan"
@@ -122,7 +122,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_a_second_run_makes_what_is_missing_and_the_same_bytes(recording: Path) -> None:
     """It lies in mav0 by default, where what reads ground truth beside a recording finds it."""
     render_room(recording)
-    truth = SimulatedGroundTruth.find(recording)
+    truth = GroundTruthFolder.find(recording)
     assert truth is not None
     first = contents(truth.folder)
     (truth.folder / "depth" / f"{STAMPS[0]}.png").unlink()
@@ -157,7 +157,7 @@ def test_other_states_need_overwrite(recording: Path) -> None:
     assert raised.value.code == "ground_truth_differs"
     assert contents(recording / "mav0/groundtruth0") == before
     render_room(recording, overwrite=True)
-    np.testing.assert_allclose(SimulatedGroundTruth(recording).camera_pose(STAMPS[0]), POSES[1], atol=1e-9)
+    np.testing.assert_allclose(GroundTruthFolder(recording).camera_pose(STAMPS[0]), POSES[1], atol=1e-9)
 
 
 def test_another_camera_needs_overwrite(recording: Path) -> None:
@@ -167,7 +167,7 @@ def test_another_camera_needs_overwrite(recording: Path) -> None:
         render_room(recording, camera="cam1")
     assert raised.value.code == "ground_truth_differs"
     render_room(recording, camera="cam1", overwrite=True)
-    assert SimulatedGroundTruth(recording).camera_name == "cam1"
+    assert GroundTruthFolder(recording).camera_name == "cam1"
     with pytest.raises(DatasetError) as raised:
         RecordingTruth(recording)
     assert raised.value.code == "ground_truth_camera_differs"
@@ -198,7 +198,7 @@ def test_states_are_of_the_imus_clock(recording: Path) -> None:
     sensor.write_text(sensor.read_text() + "timeshift_cam_imu: 0.002\n")
     write_states(recording / "mav0", POSES, [stamp + shift_ns for stamp in STAMPS])
     assert render_room(recording).rendered == 2
-    np.testing.assert_allclose(SimulatedGroundTruth(recording).camera_pose(STAMPS[1]), POSES[1], atol=1e-9)
+    np.testing.assert_allclose(GroundTruthFolder(recording).camera_pose(STAMPS[1]), POSES[1], atol=1e-9)
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
@@ -250,7 +250,7 @@ def test_a_cloud_elsewhere_with_a_pose_of_its_own(recording: Path, tmp_path: Pat
     data = T_world_cloud.reshape(-1).tolist()
     (tmp_path / "scan" / "sensor.yaml").write_text(f"{key}:\n  cols: 4\n  rows: 4\n  data: {data}\n")
     render_room(recording, cloud=tmp_path / "scan" / "room.ply")
-    depth = SimulatedGroundTruth(recording).depth(STAMPS[0])
+    depth = GroundTruthFolder(recording).depth(STAMPS[0])
     assert np.median(np.abs(depth - room_depth(CAMERA, POSES[0]))) < 0.01
 
 

@@ -10,8 +10,8 @@ import pytest
 from lidar_drive import CAMERA, POST_M, SPEED_M, WALL_M, drive_world, scan_of, wall_and_post, write_drive
 from worlds import stamp_text, write_lines
 
+from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
 from viflow_anomaly.datasets.kitti_labels import MOTION_COLUMNS
-from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.ground_truth.kitti_lidar import read_scan, render_lidar
 
@@ -41,7 +41,7 @@ def test_flow_is_that_of_driving_towards_the_wall(drive: Path) -> None:
     """u' - c = (u - c) z / (z - speed), up to Mercator's scale and 4 mm of depth."""
     summary = render_lidar(drive)
     assert (summary.frames, summary.with_scan, summary.written, summary.kept, summary.with_flow) == (4, 3, 3, 0, 2)
-    truth = SimulatedGroundTruth(drive)
+    truth = GroundTruthFolder(drive)
     assert truth.source_stamps == (STAMPS[0], STAMPS[2], STAMPS[3])
     u, v = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
     offset = np.stack([u - CAMERA.cx, v - CAMERA.cy], axis=-1)
@@ -58,7 +58,7 @@ def test_flow_is_that_of_driving_towards_the_wall(drive: Path) -> None:
 
 def test_points_behind_the_post_are_hidden(drive: Path) -> None:
     summary = render_lidar(drive)
-    depth = SimulatedGroundTruth(drive).depth(STAMPS[0])
+    depth = GroundTruthFolder(drive).depth(STAMPS[0])
     u, v = np.meshgrid(np.arange(CAMERA.width) - CAMERA.cx, np.arange(CAMERA.height) - CAMERA.cy)
     post = (np.abs(u) < 0.15 * 120 - 1) & (np.abs(v) < 0.15 * 120 - 1)
     assert set(np.round(depth[post & np.isfinite(depth)], 1)) == {POST_M}
@@ -76,8 +76,8 @@ def test_what_moves_or_may_move_is_left_out(drive: Path, moving: str) -> None:
     motion(drive, moving)
     label(drive, 0, LABEL.format(kind="Car", **BOX))
     summary = render_lidar(drive)
-    assert in_box(SimulatedGroundTruth(drive).static_flow(STAMPS[0], STAMPS[1])[1]) == 0
-    assert in_box(SimulatedGroundTruth(drive).static_flow(STAMPS[2], STAMPS[3])[1]) > 0.2
+    assert in_box(GroundTruthFolder(drive).static_flow(STAMPS[0], STAMPS[1])[1]) == 0
+    assert in_box(GroundTruthFolder(drive).static_flow(STAMPS[2], STAMPS[3])[1]) > 0.2
     assert summary.points_in_boxes > 0
     assert summary.without_labels == 2
 
@@ -86,14 +86,14 @@ def test_what_rests_is_kept(drive: Path) -> None:
     motion(drive, "0")
     label(drive, 0, LABEL.format(kind="Car", **BOX))
     assert render_lidar(drive).points_in_boxes == 0
-    assert in_box(SimulatedGroundTruth(drive).static_flow(STAMPS[0], STAMPS[1])[1]) > 0.2
+    assert in_box(GroundTruthFolder(drive).static_flow(STAMPS[0], STAMPS[1])[1]) > 0.2
 
 
 @pytest.mark.parametrize("line", [LABEL.format(kind="Cyclist", **BOX), DONT_CARE.format(**BOX)])
 def test_labels_of_which_nothing_is_said_are_left_out(drive: Path, line: str) -> None:
     label(drive, 0, line)
     render_lidar(drive)
-    assert in_box(SimulatedGroundTruth(drive).static_flow(STAMPS[0], STAMPS[1])[1]) == 0
+    assert in_box(GroundTruthFolder(drive).static_flow(STAMPS[0], STAMPS[1])[1]) == 0
 
 
 def test_a_frame_whose_labels_are_empty_is_labelled(drive: Path) -> None:
@@ -107,7 +107,7 @@ def test_boxes_shrink_with_the_images(tmp_path: Path) -> None:
     calibration.write_text(calibration.read_text().replace("S_rect_02: 200 60", "S_rect_02: 400 120"))
     label(drive, 0, LABEL.format(kind="Car", left=40, top=20, right=120, bottom=80))
     render_lidar(drive)
-    known = np.isfinite(SimulatedGroundTruth(drive).depth(STAMPS[0]))
+    known = np.isfinite(GroundTruthFolder(drive).depth(STAMPS[0]))
     assert not known[10:30, 20:61].any()
     assert known[10:30, 70:95].mean() > 0.2
 

@@ -13,14 +13,14 @@ import pytest
 from simulated_truth import add_ground_truth
 from worlds import make_world
 
+from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
 from viflow_anomaly.datasets.registry import open_recording
-from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
 from viflow_anomaly.ground_truth.picture_check import PictureCheck, check_pair
 
 
 def check(folder: Path, shift_px: float) -> PictureCheck:
     add_ground_truth(folder, make_world(frames=2), shift_px=shift_px)
-    found = check_pair(open_recording(folder), SimulatedGroundTruth(folder), 0)
+    found = check_pair(open_recording(folder), GroundTruthFolder(folder), 0)
     assert found is not None
     return found
 
@@ -40,7 +40,7 @@ def test_reversed_truth_does_not(tmp_path: Path) -> None:
 
 def test_without_a_valid_pixel_there_is_nothing_to_say(tmp_path: Path) -> None:
     add_ground_truth(tmp_path, make_world(frames=2), valid=np.zeros((64, 96), np.bool_))
-    assert check_pair(open_recording(tmp_path), SimulatedGroundTruth(tmp_path), 0) is None
+    assert check_pair(open_recording(tmp_path), GroundTruthFolder(tmp_path), 0) is None
 
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "check_ground_truth.py"

@@ -10,9 +10,9 @@ import pytest
 from room import sample_box, write_ply
 from worlds import REAL_DATA, write_lines
 
+from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
 from viflow_anomaly.datasets.recording import Recording
 from viflow_anomaly.datasets.registry import open_recording
-from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
 from viflow_anomaly.ground_truth.euroc_room import render_room
 from viflow_anomaly.ground_truth.kitti_lidar import render_lidar
 from viflow_anomaly.ground_truth.picture_check import PictureCheck, check_pair
@@ -28,7 +28,7 @@ def real(relative: str) -> Path:
     return path
 
 
-def medians(recording: Recording, truth: SimulatedGroundTruth, indices: list[int]) -> PictureCheck:
+def medians(recording: Recording, truth: GroundTruthFolder, indices: list[int]) -> PictureCheck:
     checks = [check for k in indices if (check := check_pair(recording, truth, k)) is not None]
     assert checks
     return PictureCheck(*np.median([astuple(check) for check in checks], axis=0).tolist())
@@ -39,7 +39,7 @@ def test_kitti_lidar_flow_is_what_the_pictures_show(tmp_path: Path, drive: str, 
     folder = real(f"kitti/2011_09_26/2011_09_26_drive_{drive}_sync")
     summary = render_lidar(folder, out=tmp_path)
     assert summary.written == summary.with_scan > 10
-    truth, recording = SimulatedGroundTruth(tmp_path), open_recording(folder)
+    truth, recording = GroundTruthFolder(tmp_path), open_recording(folder)
     indices = np.searchsorted(recording.frame_timestamps_ns, truth.source_stamps).tolist()
     found = medians(recording, truth, [k for k in indices if k + 1 < len(recording)])
     assert found.distance_px < limit_px
@@ -60,7 +60,7 @@ def test_a_bare_room_of_its_size_explains_most_of_eurocs_flow(tmp_path: Path) ->
     write_lines(tmp_path / "poses.csv", near)
     summary = render_room(folder, out=tmp_path, cloud=tmp_path / "walls.ply", trajectory=tmp_path / "poses.csv")
     assert (summary.rendered, summary.without_pose, summary.with_flow) == (6, 54, 3)
-    truth = SimulatedGroundTruth(tmp_path)
+    truth = GroundTruthFolder(tmp_path)
     found = medians(recording, truth, indices[::2])
     assert found.distance_px < 0.25 * found.flow_px
     assert found.warped_gray < 0.6 * found.identity_gray

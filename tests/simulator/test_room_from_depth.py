@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_sequences import small
 
-from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
+from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
 from viflow_anomaly.geometry import pixel_grid, rigid_motion_flow, unproject_pixels
 from viflow_anomaly.ground_truth.point_cloud import PointCloud, make_point_cloud
 from viflow_anomaly.ground_truth.range_image import render_depth
@@ -17,7 +17,7 @@ from viflow_anomaly.simulator import simulate
 MAX_DEPTH_M = 40.0
 
 
-def static_points(truth: SimulatedGroundTruth, stamps: list[int]) -> PointCloud:
+def static_points(truth: GroundTruthFolder, stamps: list[int]) -> PointCloud:
     camera = truth.camera
     rays = unproject_pixels(camera, pixel_grid(camera.height, camera.width))
     rays = np.concatenate([rays, np.ones((camera.height, camera.width, 1))], axis=-1)
@@ -32,7 +32,7 @@ def static_points(truth: SimulatedGroundTruth, stamps: list[int]) -> PointCloud:
 @pytest.mark.parametrize("seed", [3, 11])
 def test_static_flow_is_the_simulators(gl: None, tmp_path: Path, seed: int) -> None:
     sequence = simulate(small("drone", seed=seed, frames=9, width=192, height=128), tmp_path)[0]
-    truth = SimulatedGroundTruth(sequence)
+    truth = GroundTruthFolder(sequence)
     stamps = list(truth.source_stamps)
     source, target = stamps[4], stamps[5]
     cloud = static_points(truth, [stamp for stamp in stamps if stamp != source])

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from small_sequences import small
 
-from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
+from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
 from viflow_anomaly.errors import ConfigError, MissingDependencyError
 from viflow_anomaly.geometry import pixel_grid
 from viflow_anomaly.simulator import SimulatorConfig, run, simulate
@@ -58,7 +58,7 @@ def test_tree_is_euroc(sequence: Path) -> None:
 
 
 def test_static_flow_carries_the_target_onto_the_source(sequence: Path) -> None:
-    truth = SimulatedGroundTruth(sequence)
+    truth = GroundTruthFolder(sequence)
     stamps = stamps_of(sequence)
     warped_errors, identity_errors = [], []
     for source_ns, target_ns in itertools.pairwise(stamps):
@@ -73,7 +73,7 @@ def test_static_flow_carries_the_target_onto_the_source(sequence: Path) -> None:
 
 
 def test_flow_is_static_flow_but_on_movers(sequence: Path) -> None:
-    truth = SimulatedGroundTruth(sequence)
+    truth = GroundTruthFolder(sequence)
     stamps = stamps_of(sequence)
     moved = 0
     for source_ns, target_ns in itertools.pairwise(stamps):
@@ -99,12 +99,12 @@ def test_flow_is_static_flow_but_on_movers(sequence: Path) -> None:
 
 
 def test_stored_flow_agrees_with_depth_and_poses(sequence: Path) -> None:
-    truth = SimulatedGroundTruth(sequence)
+    truth = GroundTruthFolder(sequence)
     source_ns, target_ns = stamps_of(sequence)[:2]
     stored, _ = truth.static_flow(source_ns, target_ns)
     (sequence / f"mav0/groundtruth0/static_flow/{source_ns}.png").rename(sequence / "aside.png")
     try:
-        again = SimulatedGroundTruth(sequence)
+        again = GroundTruthFolder(sequence)
         computed, _ = again.static_flow(source_ns, target_ns)
     finally:
         (sequence / "aside.png").rename(sequence / f"mav0/groundtruth0/static_flow/{source_ns}.png")
@@ -112,7 +112,7 @@ def test_stored_flow_agrees_with_depth_and_poses(sequence: Path) -> None:
 
 
 def test_two_short_flows_compose_to_a_long_one(sequence: Path) -> None:
-    truth = SimulatedGroundTruth(sequence)
+    truth = GroundTruthFolder(sequence)
     first, _, third = stamps_of(sequence)[:3]
     flow, valid = truth.static_flow(first, third)
     short, _ = truth.static_flow(first, stamps_of(sequence)[1])
@@ -123,7 +123,7 @@ def test_two_short_flows_compose_to_a_long_one(sequence: Path) -> None:
 @pytest.mark.parametrize("rig", ["drone", "car"])
 def test_static_camera_shows_no_static_flow(gl: None, tmp_path: Path, rig: str) -> None:
     sequence = simulate(small(rig, motion="static", frames=2), tmp_path)[0]
-    truth = SimulatedGroundTruth(sequence)
+    truth = GroundTruthFolder(sequence)
     first, second = stamps_of(sequence)
     flow, valid = truth.static_flow(first, second)
     assert valid.all()
@@ -132,7 +132,7 @@ def test_static_camera_shows_no_static_flow(gl: None, tmp_path: Path, rig: str) 
 
 def test_rotation_flow_does_not_depend_on_depth(gl: None, tmp_path: Path) -> None:
     sequence = simulate(small("drone", motion="rotation", frames=2, movers=(0, 0)), tmp_path)[0]
-    truth = SimulatedGroundTruth(sequence)
+    truth = GroundTruthFolder(sequence)
     first, second = stamps_of(sequence)
     assert np.ptp(truth.depth(first)) > 0.2
     flow, valid = truth.static_flow(first, second)
@@ -144,7 +144,7 @@ def test_rotation_flow_does_not_depend_on_depth(gl: None, tmp_path: Path) -> Non
 
 def test_without_movers_masks_are_empty(gl: None, tmp_path: Path) -> None:
     sequence = simulate(small("car", movers=(0, 0), frames=2), tmp_path)[0]
-    truth = SimulatedGroundTruth(sequence)
+    truth = GroundTruthFolder(sequence)
     for stamp in stamps_of(sequence):
         assert not truth.instances(stamp).any()
         assert truth.objects(stamp) == []

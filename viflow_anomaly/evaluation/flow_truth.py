@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from viflow_anomaly.config import MotorSource, SplitConfig
 from viflow_anomaly.datasets.camera_json import camera_to_mapping
+from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
 from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.datasets.recording import Recording
 from viflow_anomaly.datasets.registry import open_recording
-from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
 from viflow_anomaly.datasets.splits import split_pairs
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.geometry import Float32Array
@@ -100,7 +100,7 @@ class RecordingTruth:
         self.recording = open_recording(path)
         self._movers = movers
         self._look_aheads = tuple(look_aheads)
-        truth = SimulatedGroundTruth.find(self.recording.root if ground_truth is None else ground_truth)
+        truth = GroundTruthFolder.find(self.recording.root if ground_truth is None else ground_truth)
         self.pairs = RecordingPairs(self.recording, self._look_aheads, motor_source=None)
         if truth is None or not self.pairs:
             found = "none" if truth is None else f"{len(self.recording)} frame"
@@ -145,7 +145,7 @@ class RecordingTruth:
         return TrueFlow(flow, valid if self._movers else valid & (self.ground_truth.instances(stamps[0]) == 0))
 
 
-def _require_same_camera(truth: SimulatedGroundTruth, recording: Recording) -> None:
+def _require_same_camera(truth: GroundTruthFolder, recording: Recording) -> None:
     """Two cameras of a rig have the same stamps, and often the same size: nothing else would tell."""
     known = camera_to_mapping(truth.camera) | {"name": truth.camera_name}
     found: dict[str, object] = {} if recording.camera is None else camera_to_mapping(recording.camera)

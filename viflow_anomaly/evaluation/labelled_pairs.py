@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from viflow_anomaly.config import MotorSource
 from viflow_anomaly.datasets import kitti_raw
+from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
 from viflow_anomaly.datasets.kitti_labels import (
     LABELLED_CAMERA,
     MOTION_FILE,
@@ -27,7 +28,6 @@ from viflow_anomaly.datasets.kitti_labels import (
 )
 from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.datasets.registry import open_recording
-from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.evaluation.flow_run import group_of
 from viflow_anomaly.evaluation.flow_truth import RecordingTruth
@@ -138,11 +138,11 @@ class SimulatedPairs:
         return labels_of(self._truth.ground_truth, self._truth.name(index).source_timestamp_ns)
 
 
-def labels_of(truth: SimulatedGroundTruth, source_timestamp_ns: int) -> Labels:
+def labels_of(truth: GroundTruthFolder, source_timestamp_ns: int) -> Labels:
     """The movers of one frame of a simulated sequence.
 
     Raises:
-        DatasetError: as ``SimulatedGroundTruth.instances`` and ``objects``.
+        DatasetError: as ``GroundTruthFolder.instances`` and ``objects``.
     """
     instances = truth.instances(source_timestamp_ns)
     pixels = Pixels(np.zeros(instances.shape, dtype=np.bool_), np.zeros(instances.shape, dtype=np.bool_))

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
 from viflow_anomaly.datasets.recording import Recording
-from viflow_anomaly.datasets.simulated_ground_truth import SimulatedGroundTruth
 from viflow_anomaly.geometry import pixel_grid, sample_bilinear
 
 MIN_GRADIENT_GRAY = 60.0
@@ -27,11 +27,11 @@ class PictureCheck:
     warped_gray: float
 
 
-def check_pair(recording: Recording, truth: SimulatedGroundTruth, index: int) -> PictureCheck | None:
+def check_pair(recording: Recording, truth: GroundTruthFolder, index: int) -> PictureCheck | None:
     """Frame ``index`` and the next one; None where the truth leaves no pixel to judge.
 
     Raises:
-        DatasetError: as ``SimulatedGroundTruth.static_flow``.
+        DatasetError: as ``GroundTruthFolder.static_flow``.
     """
     source, target = recording.frame(index), recording.frame(index + 1)
     flow, valid = truth.static_flow(source.timestamp_ns, target.timestamp_ns)

@@ -1,4 +1,4 @@
-"""The folder ``groundtruth0`` that is written for a recording; ``SimulatedGroundTruth`` reads it.
+"""The folder ``groundtruth0`` that is written for a recording; ``GroundTruthFolder`` reads it.
 
 ```
 groundtruth0/
@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from viflow_anomaly.checkpoint_record import write_atomically
 from viflow_anomaly.datasets.camera_json import camera_to_mapping
+from viflow_anomaly.datasets.ground_truth_folder import POSES_NAME, RECORD_NAME
 from viflow_anomaly.datasets.ground_truth_png import write_depth_png, write_flow_png, write_mask_png
 from viflow_anomaly.datasets.recording import FileRecording
-from viflow_anomaly.datasets.simulated_ground_truth import POSES_NAME, RECORD_NAME
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.ground_truth.frame_poses import quaternion_of
 from viflow_anomaly.sensor_data import Float64Array, PinholeCamera

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from viflow_anomaly.datasets.ground_truth_folder import OBJECT_COLUMNS
 from viflow_anomaly.datasets.ground_truth_png import write_depth_png, write_flow_png, write_instances_png
-from viflow_anomaly.datasets.simulated_ground_truth import OBJECT_COLUMNS
 from viflow_anomaly.sensor_data import Float64Array, Uint8Array
 from viflow_anomaly.simulator.config import SimulatorConfig
 from viflow_anomaly.simulator.drive import drive, park

@@ -72,7 +72,7 @@ def ground_truth_folder(root: Path) -> Path | None:
     return next((place for place in places if place.is_dir()), None)
 
 
-class SimulatedGroundTruth:
+class GroundTruthFolder:
     """Ground truth of one sequence: simulated, or rendered for a recording.
 
     Args:

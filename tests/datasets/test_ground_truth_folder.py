@@ -12,6 +12,12 @@ import pytest
 
 from viflow_anomaly.config import ImageLimits
 from viflow_anomaly.datasets import ground_truth_png
+from viflow_anomaly.datasets.ground_truth_folder import (
+    OBJECT_COLUMNS,
+    GroundTruthFolder,
+    MovingObject,
+    ground_truth_folder,
+)
 from viflow_anomaly.datasets.ground_truth_png import (
     read_depth_png,
     read_flow_png,
@@ -19,12 +25,6 @@ from viflow_anomaly.datasets.ground_truth_png import (
     write_flow_png,
     write_instances_png,
     write_mask_png,
-)
-from viflow_anomaly.datasets.simulated_ground_truth import (
-    OBJECT_COLUMNS,
-    MovingObject,
-    SimulatedGroundTruth,
-    ground_truth_folder,
 )
 from viflow_anomaly.errors import DatasetError
 
@@ -177,12 +177,12 @@ def test_missing_pngs_are_named(tmp_path: Path) -> None:
 
 def test_found_at_root_and_mav0_and_nowhere_else(root: Path, tmp_path: Path) -> None:
     for place in (root, root / "mav0"):
-        truth = SimulatedGroundTruth.find(place)
+        truth = GroundTruthFolder.find(place)
         assert truth is not None
         assert truth.folder == root / "mav0" / "groundtruth0"
-    assert SimulatedGroundTruth.find(tmp_path) is None
+    assert GroundTruthFolder.find(tmp_path) is None
     with pytest.raises(DatasetError, match="groundtruth0") as raised:
-        SimulatedGroundTruth(tmp_path)
+        GroundTruthFolder(tmp_path)
     assert raised.value.code == "ground_truth_missing"
 
 
@@ -192,14 +192,14 @@ def test_found_beside_mav0_where_that_has_none(root: Path) -> None:
     beside = root / "groundtruth0"
     assert ground_truth_folder(root) == root / "mav0" / "groundtruth0"
     shutil.rmtree(root / "mav0" / "groundtruth0")
-    found = SimulatedGroundTruth.find(root)
+    found = GroundTruthFolder.find(root)
     assert found is not None
-    assert found.folder == SimulatedGroundTruth(root).folder == ground_truth_folder(root) == beside
+    assert found.folder == GroundTruthFolder(root).folder == ground_truth_folder(root) == beside
     assert found.is_rendered
 
 
 def test_static_flow_of_neighbours_is_the_stored_one(root: Path) -> None:
-    flow, valid = SimulatedGroundTruth(root).static_flow(STAMPS[0], STAMPS[1])
+    flow, valid = GroundTruthFolder(root).static_flow(STAMPS[0], STAMPS[1])
     np.testing.assert_allclose(flow[..., 0], -1.25)
     assert valid.all()
 
@@ -208,7 +208,7 @@ def test_static_flow_of_neighbours_is_the_stored_one(root: Path) -> None:
 def test_static_flow_of_any_two_frames_comes_from_depth_and_poses(
     root: Path, source: int, target: int, expected: float
 ) -> None:
-    flow, valid = SimulatedGroundTruth(root).static_flow(STAMPS[source], STAMPS[target])
+    flow, valid = GroundTruthFolder(root).static_flow(STAMPS[source], STAMPS[target])
     np.testing.assert_allclose(flow[..., 0], expected, atol=1e-4)
     np.testing.assert_allclose(flow[..., 1], 0.0, atol=1e-4)
     assert valid.all()
@@ -216,12 +216,12 @@ def test_static_flow_of_any_two_frames_comes_from_depth_and_poses(
 
 def test_static_flow_without_its_png_comes_from_depth(root: Path) -> None:
     (root / f"mav0/groundtruth0/static_flow/{STAMPS[0]}.png").unlink()
-    flow, _ = SimulatedGroundTruth(root).static_flow(STAMPS[0], STAMPS[1])
+    flow, _ = GroundTruthFolder(root).static_flow(STAMPS[0], STAMPS[1])
     np.testing.assert_allclose(flow[..., 0], -1.25, atol=1e-4)
 
 
 def test_flow_instances_and_objects(root: Path) -> None:
-    truth = SimulatedGroundTruth(root)
+    truth = GroundTruthFolder(root)
     assert truth.flow(STAMPS[0])[0].shape == (32, 40, 2)
     assert truth.instances(STAMPS[0]).sum() == 30
     assert truth.objects(STAMPS[0]) == [MovingObject(STAMPS[0], 1, 30, 5, 4, 10, 8, 1.5)]
@@ -231,7 +231,7 @@ def test_flow_instances_and_objects(root: Path) -> None:
 @pytest.mark.parametrize("stamp", [STAMPS[0] - 1, STAMPS[0] + 1, STAMPS[2] + 1])
 def test_unknown_stamps_are_named(root: Path, stamp: int) -> None:
     with pytest.raises(DatasetError, match=str(stamp)) as raised:
-        SimulatedGroundTruth(root).camera_pose(stamp)
+        GroundTruthFolder(root).camera_pose(stamp)
     assert raised.value.code == "ground_truth_missing"
 
 
@@ -239,7 +239,7 @@ def test_unknown_stamps_are_named(root: Path, stamp: int) -> None:
 def test_malformed_states_are_named_with_their_line(root: Path, line: str) -> None:
     (root / "mav0/state_groundtruth_estimate0/data.csv").write_text(f"#header\n{line}\n")
     with pytest.raises(DatasetError, match="line 2") as raised:
-        SimulatedGroundTruth(root).camera_pose(STAMPS[0])
+        GroundTruthFolder(root).camera_pose(STAMPS[0])
     assert raised.value.code == "ground_truth_malformed"
 
 
@@ -247,7 +247,7 @@ def test_malformed_states_are_named_with_their_line(root: Path, line: str) -> No
 def test_malformed_objects_are_named_with_their_line(root: Path, line: str) -> None:
     (root / "mav0/groundtruth0/objects.csv").write_text(f"header\n{line}\n")
     with pytest.raises(DatasetError, match=r"objects\.csv, line 2") as raised:
-        SimulatedGroundTruth(root).objects(STAMPS[0])
+        GroundTruthFolder(root).objects(STAMPS[0])
     assert raised.value.code == "ground_truth_malformed"
 
 
@@ -255,14 +255,14 @@ def test_malformed_objects_are_named_with_their_line(root: Path, line: str) -> N
 def test_objects_that_are_no_csv_are_named(root: Path, content: bytes) -> None:
     (root / "mav0/groundtruth0/objects.csv").write_bytes(content)
     with pytest.raises(DatasetError, match=r"objects\.csv: expected a CSV") as raised:
-        SimulatedGroundTruth(root).objects(STAMPS[0])
+        GroundTruthFolder(root).objects(STAMPS[0])
     assert raised.value.code == "ground_truth_malformed"
 
 
 def test_missing_objects_file_is_named(root: Path) -> None:
     (root / "mav0/groundtruth0/objects.csv").unlink()
     with pytest.raises(DatasetError, match=r"objects\.csv") as raised:
-        SimulatedGroundTruth(root).objects(STAMPS[0])
+        GroundTruthFolder(root).objects(STAMPS[0])
     assert raised.value.code == "ground_truth_missing"
 
 
@@ -282,7 +282,7 @@ def test_unusable_calibration_is_named(root: Path, text: str | None) -> None:
     path = root / "mav0/cam0/sensor.yaml"
     path.unlink() if text is None else path.write_text(text)
     with pytest.raises(DatasetError, match=r"sensor\.yaml") as raised:
-        _ = SimulatedGroundTruth(root).camera
+        _ = GroundTruthFolder(root).camera
     assert raised.value.code == "ground_truth_malformed"
 
 
@@ -290,29 +290,29 @@ def test_poses_need_the_states_and_the_mounting(root: Path) -> None:
     sensor, states = root / "mav0/cam0/sensor.yaml", root / "mav0/state_groundtruth_estimate0/data.csv"
     sensor.write_text(SENSOR_YAML.replace("data: [1.0,", "data: ["))
     with pytest.raises(DatasetError, match=r"sensor\.yaml: data: expected 16") as malformed:
-        SimulatedGroundTruth(root).camera_pose(STAMPS[0])
+        GroundTruthFolder(root).camera_pose(STAMPS[0])
     assert malformed.value.code == "ground_truth_malformed"
     sensor.write_text(SENSOR_YAML)
     states.unlink()
     with pytest.raises(DatasetError, match=r"data\.csv: expected the simulated states") as missing:
-        SimulatedGroundTruth(root).camera_pose(STAMPS[0])
+        GroundTruthFolder(root).camera_pose(STAMPS[0])
     assert missing.value.code == "ground_truth_missing"
 
 
 def test_opencvs_yaml_and_a_lens_are_read_as_the_recordings(root: Path) -> None:
     lens = "distortion_model: radial-tangential\ndistortion_coefficients: [-0.28, 0.07, 2e-4, 1.8e-5]\n"
     (root / "mav0/cam0/sensor.yaml").write_text("%YAML:1.0" + SENSOR_YAML + lens)
-    assert SimulatedGroundTruth(root).camera.distortion_coeffs == (-0.28, 0.07, 2e-4, 1.8e-5)
+    assert GroundTruthFolder(root).camera.distortion_coeffs == (-0.28, 0.07, 2e-4, 1.8e-5)
 
 
 def test_camera_of_the_sequence(root: Path) -> None:
-    truth = SimulatedGroundTruth(root)
+    truth = GroundTruthFolder(root)
     camera = truth.camera
     assert (truth.camera_name, truth.is_rendered, truth.has_instances) == ("cam0", False, True)
     assert (camera.fx, camera.cx, camera.width, camera.height) == (50.0, 20.0, 40, 32)
 
 
-def rendered(folder: Path, record: str | None = None) -> SimulatedGroundTruth:
+def rendered(folder: Path, record: str | None = None) -> GroundTruthFolder:
     """What was rendered for a recording: camera and poses in the folder; depth of the first frame only, half known."""
     truth = folder / "groundtruth0"
     (truth / "depth").mkdir(parents=True)
@@ -324,7 +324,7 @@ def rendered(folder: Path, record: str | None = None) -> SimulatedGroundTruth:
     (truth / "poses.csv").write_text(
         "#pose\n" + "".join(f"{stamp},{0.1 * k},0,0,1,0,0,0\n" for k, stamp in enumerate(STAMPS))
     )
-    return SimulatedGroundTruth(folder)
+    return GroundTruthFolder(folder)
 
 
 @pytest.mark.parametrize(("target", "expected"), [(1, -1.25), (2, -2.5)])
@@ -358,7 +358,7 @@ def test_the_next_frame_is_the_next_pose_not_the_next_depth(tmp_path: Path) -> N
 
 
 def test_occluded_is_stored_or_comes_from_both_depths(root: Path) -> None:
-    truth = SimulatedGroundTruth(root)
+    truth = GroundTruthFolder(root)
     assert not truth.occluded(STAMPS[0], STAMPS[1]).any()
     near = np.full((32, 40), 4.0, np.float32)
     near[:, 20:] = 2.0
