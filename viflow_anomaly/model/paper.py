@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import torch
@@ -19,8 +20,24 @@ def _stream(numbers: int) -> nn.Sequential:
     """One modality's four fully connected layers of 512, 4096, 4096, 512."""
     layers: list[nn.Module] = []
     for width_in, width in pairwise((numbers, *GLOBAL_WIDTHS)):
-        layers += [nn.Linear(width_in, width), nn.ReLU(inplace=True)]
+        layers += [_he(nn.Linear(width_in, width)), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers)
+
+
+def _he(layer: nn.Linear | nn.Conv2d | nn.ConvTranspose2d) -> nn.Module:
+    """Start a layer so that ReLU layers keep the size of what goes through them (He et al., ICCV 2015).
+
+    The paper does not say how it starts. With torch's default a dozen layers shrink the image to nothing, and the local
+    shifter says the same of every picture for hundreds of steps. A number leaves a transposed convolution of stride 2
+    through a quarter of its kernel.
+    """
+    fan_in = layer.weight[0].numel()
+    if isinstance(layer, nn.ConvTranspose2d):
+        fan_in = layer.weight[:, 0].numel() // (layer.stride[0] * layer.stride[1])
+    nn.init.normal_(layer.weight, std=math.sqrt(2 / fan_in))
+    assert layer.bias is not None
+    nn.init.zeros_(layer.bias)
+    return layer
 
 
 class PaperGlobalShifter(nn.Module):
@@ -66,7 +83,7 @@ class PaperDecoder(nn.Module):
         layers: list[nn.Module] = []
         for filters_in, filters_out in pairwise(filters):
             layers += [
-                nn.ConvTranspose2d(filters_in, filters_out, 5, stride=2, padding=2, output_padding=1),
+                _he(nn.ConvTranspose2d(filters_in, filters_out, 5, stride=2, padding=2, output_padding=1)),
                 nn.ReLU(inplace=True),
             ]
         shifts = nn.Conv2d(filters[-1], 2, 3, padding=1)
@@ -106,14 +123,14 @@ class PaperViflow(nn.Module):
         filters = (1, *LOCAL_FILTERS)
         layers: list[nn.Module] = []
         for filters_in, filters_out in pairwise(filters):
-            layers += [nn.Conv2d(filters_in, filters_out, 5, stride=2, padding=2), nn.ReLU(inplace=True)]
+            layers += [_he(nn.Conv2d(filters_in, filters_out, 5, stride=2, padding=2)), nn.ReLU(inplace=True)]
         self.encoder = nn.Sequential(*layers)
         self.code_shape = (LOCAL_FILTERS[-1], height // 32, width // 32)
         code_numbers = self.code_shape[0] * self.code_shape[1] * self.code_shape[2]
         self.fusion = nn.Sequential(
-            nn.Linear(code_numbers + self.global_shifter.code_width, FUSION_WIDTH),
+            _he(nn.Linear(code_numbers + self.global_shifter.code_width, FUSION_WIDTH)),
             nn.ReLU(inplace=True),
-            nn.Linear(FUSION_WIDTH, code_numbers),
+            _he(nn.Linear(FUSION_WIDTH, code_numbers)),
             nn.ReLU(inplace=True),
         )
         self.decoders = nn.ModuleList(PaperDecoder() for _ in range(hypotheses))
