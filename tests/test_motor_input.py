@@ -18,6 +18,7 @@ from worlds import car_world, make_world, write_euroc, write_kitti_raw, write_li
 from viflow_anomaly import prediction
 from viflow_anomaly.batch import collate
 from viflow_anomaly.checkpoint import load_checkpoint, save_checkpoint
+from viflow_anomaly.checkpoint_record import CheckpointRecord
 from viflow_anomaly.cli.main import run
 from viflow_anomaly.config import (
     CorrectionConfig,
@@ -130,6 +131,38 @@ def test_a_command_that_nobody_would_look_at_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError) as raised:
         require_supported(pair, None)
     assert raised.value.code == "motor_command_unsupported"
+
+
+@pytest.mark.parametrize(("inputs", "motor", "count"), [("sffms", THREE, 3), ("motor", SPEED, 1)])
+@pytest.mark.parametrize("value", [1e7, -1e300])
+def test_a_command_that_nothing_moves_by_is_refused(
+    tmp_path: Path, inputs: MotionInputs, motor: MotorConfig, count: int, value: float
+) -> None:
+    with pytest.raises(InvalidInputError, match="at most 1e\\+06 in size") as raised:
+        motor_input(pair_with(tmp_path, [value] * count), config(inputs, motor))
+    assert raised.value.code == "motor_command_invalid"
+
+
+def test_more_numbers_than_a_command_has_are_refused() -> None:
+    with pytest.raises(ConfigError, match="at most 64 numbers, found 65") as raised:
+        fitted_motor(np.zeros((3, 65)), config("motor", MotorConfig()), seed=0)
+    assert raised.value.code == "config_invalid"
+
+
+@pytest.mark.parametrize("inputs", ["sffms", "motor"])
+def test_a_record_without_fitted_values_is_no_checkpoint(inputs: MotionInputs) -> None:
+    with pytest.raises(ConfigError, match="expected the values that a training fits"):
+        CheckpointRecord.from_mapping(
+            {"name": "n", "version": "1", "sha256": "ab" * 32, "model": config(inputs, MotorConfig()).model_dump()},
+            where="test",
+        )
+
+
+def test_a_training_that_diverges_says_so(tmp_path: Path) -> None:
+    training = TRAINING.model_copy(update={"learning_rate": 1e18, "steps": 30, "warmup_steps": 0})
+    with pytest.raises(ConfigError, match="the training has diverged") as raised:
+        train([write_moving(tmp_path / "a")], tmp_path / "run", model=config("imu"), training=training, progress=False)
+    assert raised.value.code == "training_diverged"
 
 
 @pytest.mark.parametrize("inputs", ["sffms", "motor"])

@@ -30,7 +30,7 @@ def example() -> Batch:
     flow = np.zeros((ROWS, COLUMNS, 2), np.float32)
     flow[..., 0] = FOCAL_PX / DEPTH_M * TRANSLATIONS_M[0][0]
     measured = MeasuredFlow(flow, np.ones((ROWS, COLUMNS), np.float32), STRIDE)
-    return Batch(source, target, torch.zeros(1, 16, 6), torch.tensor([0.05]), (measured,))
+    return Batch(source, target, torch.zeros(1, 16, 6), torch.tensor([0.05]), measured=(measured,))
 
 
 def loss_of(inverse_depth: torch.Tensor, batch: Batch) -> LossResult:

@@ -9,9 +9,9 @@ import os
 import subprocess
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from viflow_anomaly.config import FrozenConfig, ModelConfig
 from viflow_anomaly.errors import CheckpointError, ConfigError
@@ -40,6 +40,14 @@ class CheckpointRecord(FrozenConfig):
     model: ModelConfig
     onnx_sha256: str | None = Field(default=None, pattern="^[0-9a-f]{64}$")
     provenance: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _motor_stream_is_fitted(self) -> Self:
+        if not self.model.motor_is_fitted:
+            raise ValueError(
+                f"model.motor: expected the values that a training fits for {self.model.motion_inputs!r}, found none"
+            )
+        return self
 
 
 def bundled_checkpoint() -> Path:

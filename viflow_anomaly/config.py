@@ -164,6 +164,13 @@ class ModelConfig(FrozenConfig):
         return "command" if "motor" in self.motion_inputs else None
 
     @property
+    def motor_is_fitted(self) -> bool:
+        """Whether the motor stream, where there is one, has the values that a training fits."""
+        if self.motor_source is None:
+            return True
+        return bool(self.motor.centroids_m if self.motor_source == "displacement" else self.motor.mean)
+
+    @property
     def motor_numbers(self) -> int:
         """How many numbers the network's motor stream takes; 0: it has none, or a command that is not fitted yet."""
         return {"displacement": self.motor.clusters, "command": 2 * len(self.motor.mean), None: 0}[self.motor_source]

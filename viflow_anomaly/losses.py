@@ -9,6 +9,8 @@ import torch.nn.functional as F  # noqa: N812  # torch's own convention
 
 from viflow_anomaly.model.outputs import ViflowOutput
 
+FARTHEST = 1e4
+"""Half image sides at which a coordinate is far enough outside: torch's gradient crashes at what no integer holds."""
 CHARBONNIER_EPSILON = 0.01
 """In the normalised intensities of ``photometric_loss``, about one gray level."""
 
@@ -35,6 +37,7 @@ def warp(image: torch.Tensor, flow_px: torch.Tensor) -> tuple[torch.Tensor, torc
     y = torch.arange(height, device=image.device, dtype=flow_px.dtype)[:, None] + flow_px[:, 1]
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
     grid = torch.stack([2 * x / (width - 1) - 1, 2 * y / (height - 1) - 1], dim=-1)
+    grid = grid.clamp(-FARTHEST, FARTHEST)
     sampled = F.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)
     return sampled, inside.unsqueeze(1)
 

@@ -21,6 +21,9 @@ MIRRORED_DISPLACEMENT_SIGNS = (-1, 1, 1)
 """Left and right exchanged in the camera's axes."""
 INTERVALS_PER_UNIT = 10.0
 """Intervals are fed in tenths of a second, so that they are near 1, as everywhere in the networks."""
+MAX_COMMAND = 1e6
+"""No speed or displacement in SI units is larger; distances of such numbers overflow."""
+MAX_COMMAND_NUMBERS = 64
 MIN_DEVIATION = 1e-6
 """Of a command over its size: what varied less did not vary, and is not blown up when it does one day."""
 KMEANS_STARTS = 8
@@ -59,7 +62,7 @@ def require_command(command: Float64Array | None, config: ModelConfig) -> Float6
     """The command that a model with a motor stream needs, before it is encoded.
 
     Raises:
-        InvalidInputError: ``motor_command_missing``, ``motor_command_length``.
+        InvalidInputError: ``motor_command_missing``, ``motor_command_invalid``, ``motor_command_length``.
     """
     wanted = {
         "displacement": "the camera's displacement x y z between the frames, in metres along the source camera's axes",
@@ -70,6 +73,13 @@ def require_command(command: Float64Array | None, config: ModelConfig) -> Float6
         raise InvalidInputError(
             f"motor_command: this model (motion inputs {config.motion_inputs}) expects {wanted}, found none",
             code="motor_command_missing",
+            field="motor_command",
+        )
+    if not np.isfinite(command).all() or np.abs(command).max(initial=0) > MAX_COMMAND:
+        found = str(command.tolist())[:99]
+        raise InvalidInputError(
+            f"motor_command: expected finite numbers of at most {MAX_COMMAND:g} in size, found {found}",
+            code="motor_command_invalid",
             field="motor_command",
         )
     count = 3 if config.motor_source == "displacement" else len(config.motor.mean) or len(command)
@@ -90,7 +100,7 @@ def encode(commands: Float64Array, interval_s: NDArray[np.floating], config: Mod
         ConfigError: ``motor_not_fitted``.
     """
     fitted = config.motor
-    if not (fitted.centroids_m if config.motor_source == "displacement" else fitted.mean):
+    if not config.motor_is_fitted:
         raise ConfigError(
             f"model.motor: expected values fitted by a training for the motion inputs {config.motion_inputs!r}, "
             "found none",
@@ -123,8 +133,15 @@ def fitted_motor(commands: Float64Array, config: ModelConfig, *, seed: int) -> M
     """``config`` with the motor stream's values fitted to the training pairs' commands [P, C].
 
     Raises:
-        ConfigError: ``config_invalid``: fewer different displacements than clusters, or clusters that stay empty.
+        ConfigError: ``config_invalid``: fewer different displacements than clusters, clusters that stay empty, or
+            commands of more than 64 numbers.
     """
+    if commands.shape[1] > MAX_COMMAND_NUMBERS:
+        raise ConfigError(
+            f"motor commands: expected at most {MAX_COMMAND_NUMBERS} numbers, found {commands.shape[1]}",
+            code="config_invalid",
+            field="model.motor",
+        )
     if config.motor_source == "displacement":
         values = {"centroids_m": _kmeans(commands, config.motor.clusters, seed=seed)}
     else:

@@ -49,7 +49,11 @@ class TrainingRun:
         self.step = 0
 
     def train_step(self, data: TrainingData) -> tuple[float, torch.Tensor]:
-        """One optimiser step; the loss and the wins of each hypothesis [K]."""
+        """One optimiser step; the loss and the wins of each hypothesis [K].
+
+        Raises:
+            ConfigError: ``training_diverged``.
+        """
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(self.config, self.step)
         batch = data.sample(
@@ -59,13 +63,25 @@ class TrainingRun:
         with torch.autocast(torch.device(self.device).type, dtype=torch.bfloat16, enabled=self.config.autocast):
             output = self.network(source, batch.motion, batch.interval_s, batch.motor)
         output = output._replace(flow_px=output.flow_px.float())
+        if not bool(torch.isfinite(output.flow_px).all()):
+            raise self._diverged()
         loss, winners = self._loss(output, batch)
+        if not math.isfinite(float(loss.detach())):
+            raise self._diverged()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
         self.optimizer.step()
         self.step += 1
         return float(loss.detach()), torch.bincount(winners, minlength=self.model_config.hypotheses)
+
+    def _diverged(self) -> ConfigError:
+        return ConfigError(
+            f"step {self.step}: expected finite flow and a finite loss, found others: the training has diverged; "
+            "a smaller training.learning_rate, and motor values of usual size, help",
+            code="training_diverged",
+            field="training.learning_rate",
+        )
 
     def _relit(self, source: torch.Tensor) -> torch.Tensor:
         """What the network is shown: another exposure, contrast and noise than the loss sees, by the step's number."""

@@ -181,8 +181,7 @@ def _all_commands(buckets: Sequence[PairBucket]) -> Float64Array | None:
 
 def _fitted(config: ModelConfig, buckets: Sequence[PairBucket], *, seed: int) -> ModelConfig:
     commands = _all_commands(buckets)
-    is_fitted = bool(config.motor.centroids_m if config.motor_source == "displacement" else config.motor.mean)
-    return config if commands is None or is_fitted else fitted_motor(commands, config, seed=seed)
+    return config if commands is None or config.motor_is_fitted else fitted_motor(commands, config, seed=seed)
 
 
 def _add_recording(
