@@ -201,6 +201,22 @@ def test_recordings_are_told_apart_by_their_names(ask: Ask, checkpoint: Path, tm
     assert "sequence_names" in answer.err
 
 
+def test_places_that_cannot_be_written_are_found_before_the_measurement(
+    ask: Ask, recordings: list[Path], checkpoint: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "file"
+    file.write_text("kept")
+    for more in (
+        ("--out", str(tmp_path)),
+        ("--plots", str(file)),
+        ("--out", str(tmp_path / "a"), "--latex", str(tmp_path / "a")),
+    ):
+        answer = ask(flow(recordings, checkpoint, *more))
+        assert answer.code == 2
+        assert "output_unusable" in answer.err
+    assert file.read_text() == "kept"
+
+
 def test_refusals(ask: Ask, recordings: list[Path], checkpoint: Path, tmp_path: Path) -> None:
     plain = write_euroc(tmp_path / "V1_01")
     assert ask(flow([plain], checkpoint)).is_refusal("[ground_truth_missing]")
@@ -218,7 +234,7 @@ def test_refusals(ask: Ask, recordings: list[Path], checkpoint: Path, tmp_path: 
 
 def test_a_result_that_cannot_be_written(ask: Ask, recordings: list[Path], checkpoint: Path, tmp_path: Path) -> None:
     answer = ask(flow(recordings[2:], checkpoint, "--methods", "none", "--out", str(tmp_path)))
-    assert answer.is_refusal(f"{tmp_path.name}: expected a file or nothing there")
+    assert answer.is_refusal(f"{tmp_path.name}: expected the name of a file to write, found a directory")
 
 
 @pytest.mark.parametrize("arguments", [["evaluate"], ["evaluate", "flow"], ["evaluate", "detect"]])

@@ -54,6 +54,16 @@ def test_the_command_takes_the_benchmark(root: Path, capsys: pytest.CaptureFixtu
     assert list(report["sequences"]) == list(DRIVES)
 
 
+@pytest.mark.parametrize(
+    "more", [("--look-aheads", "2"), ("--ground-truth", "."), ("--test-part", "--set", "training.split.rule=blocks")]
+)
+def test_what_has_no_meaning_for_the_benchmark_is_refused(
+    root: Path, more: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["evaluate", "flow", str(root), "--checkpoint", "none", "--methods", "identity", *more]) == 2
+    assert "scene_flow_options" in capsys.readouterr().err
+
+
 def test_a_displacement_needs_the_mounting(root: Path) -> None:
     truth = open_scene_flow(root)[0]
     np.testing.assert_allclose(truth.pair(0, "displacement").motor_command, np.zeros(3), atol=1e-6)  # it only turns

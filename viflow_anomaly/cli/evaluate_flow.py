@@ -112,6 +112,7 @@ def flow(
         from viflow_anomaly.evaluation.plot_style import require_matplotlib
 
         require_matplotlib()
+    _require_places(out, markdown, latex, plots)
     cv2.setNumThreads(settings.threads)
     named = _checkpoints(checkpoint, settings)
     whole = _truths(recordings, _numbers(look_aheads), ground_truth, movers)
@@ -142,6 +143,20 @@ def flow(
     print(_json(report)) if as_json else _print(report)
     if plots is not None:
         _draw(plots, measurement, chosen, truths, max_pairs, {name: path for name, path in named if path is not None})
+
+
+def _require_places(*places: Path | None) -> None:
+    """Find out before the measurement that a result could not be written, or would be written over another."""
+    from viflow_anomaly.errors import ConfigError
+
+    *files, plots = places
+    given = [path.resolve() for path in places if path is not None]
+    for path in [path for path in files if path is not None and path.is_dir()]:
+        raise ConfigError(f"{path}: expected the name of a file to write, found a directory", code="output_unusable")
+    if plots is not None and plots.exists() and not plots.is_dir():
+        raise ConfigError(f"{plots}: expected a directory for pictures, found a file", code="output_unusable")
+    if len(set(given)) < len(given):
+        raise ConfigError(f"expected places of their own for each result, found {given}", code="output_unusable")
 
 
 def _numbers(text: str) -> list[int]:
@@ -193,6 +208,13 @@ def _truths(
     truths: list[RecordingTruth | SceneFlowTruth] = []
     for path in recordings:
         if is_scene_flow(path):
+            if ground_truth is not None or tuple(look_aheads) != (1,):
+                raise ConfigError(
+                    f"{path}: expected neither --ground-truth nor --look-aheads with KITTI scene flow, whose pairs and "
+                    f"flow are its own, found {ground_truth or list(look_aheads)}",
+                    code="scene_flow_options",
+                    field="look_aheads" if ground_truth is None else "ground_truth",
+                )
             truths += open_scene_flow(path, movers=movers)
         else:
             truths.append(RecordingTruth(path, look_aheads, ground_truth=ground_truth, movers=movers))
@@ -223,6 +245,12 @@ def _test_parts(
             "--test-part: expected the split that the training had (--set training.split.rule=blocks), found none",
             code="split_rule_unknown",
             field="training.split.rule",
+        )
+    if not all(isinstance(truth, RecordingTruth) for truth in truths):
+        raise ConfigError(
+            "--test-part: expected recordings, found KITTI scene flow, which is a test of its own",
+            code="scene_flow_options",
+            field="training.split",
         )
     for _, path in named:
         checkpoint = path or bundled_checkpoint()

@@ -7,6 +7,7 @@ written beside its place and renamed.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 def _write_png(path: Path, image: NDArray[Any]) -> None:
     encoded, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     assert encoded
-    partial = path.with_name(path.name + ".partial")
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")  # two runs may write one picture
     partial.write_bytes(data.tobytes())
     partial.replace(path)
 
