@@ -9,18 +9,26 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from viflow_anomaly.cli.flow_inputs import (
+    DEFAULT,
+    baselines_of,
+    named_checkpoints,
+    networks_of,
+    numbers_of,
+    open_truths,
+    require_distinct,
+    require_places,
+    result_files,
+    test_parts,
+)
 from viflow_anomaly.cli.options import AsJson, Assignments, ConfigFile, Device, Threads, settings_from
 from viflow_anomaly.cli.progress import stderr_progress
 from viflow_anomaly.cli.tables import rich_table
 
 if TYPE_CHECKING:
-    from viflow_anomaly.evaluation.flow_methods import FlowMethod, NetworkMethod
+    from viflow_anomaly.evaluation.flow_methods import FlowMethod
     from viflow_anomaly.evaluation.flow_run import FlowMeasurement
-    from viflow_anomaly.evaluation.flow_truth import FlowTruth, RecordingTruth
-    from viflow_anomaly.evaluation.sceneflow_truth import SceneFlowTruth
-    from viflow_anomaly.settings import Settings
-
-DEFAULT, NONE = "default", "none"
+    from viflow_anomaly.evaluation.flow_truth import FlowTruth
 
 
 def flow(
@@ -112,15 +120,15 @@ def flow(
         from viflow_anomaly.evaluation.plot_style import require_matplotlib
 
         require_matplotlib()
-    _require_places(out, markdown, latex, plots)
+    require_places(out, markdown, latex, plots)
     cv2.setNumThreads(settings.threads)
-    named = _checkpoints(checkpoint, settings)
-    whole = _truths(recordings, _numbers(look_aheads), ground_truth, movers)
-    truths: Sequence[FlowTruth] = _test_parts(whole, named, settings) if test_part else whole
-    baselines, left_out = _baselines(methods)
-    networks = _networks(named, settings)
-    chosen = [*baselines, *_result_files(results or [], truths, max_pairs), *networks]
-    _require_distinct(chosen)
+    named = named_checkpoints(checkpoint, settings)
+    whole = open_truths(recordings, numbers_of(look_aheads), ground_truth, movers)
+    truths: Sequence[FlowTruth] = test_parts(whole, named, settings) if test_part else whole
+    baselines, left_out = baselines_of(methods)
+    networks = networks_of(named, settings)
+    chosen = [*baselines, *result_files(results or [], truths, max_pairs), *networks]
+    require_distinct(chosen)
     with stderr_progress() as progress:
         task = progress.add_task("pairs", total=None)
         measurement = measure_flow_methods(
@@ -131,7 +139,7 @@ def flow(
             repeats=repeats,
             on_progress=lambda done, total: progress.update(task, completed=done, total=total),
         )
-    options: dict[str, Any] = {"look_aheads": _numbers(look_aheads), "max_pairs": max_pairs, "crop_px": crop}
+    options: dict[str, Any] = {"look_aheads": numbers_of(look_aheads), "max_pairs": max_pairs, "crop_px": crop}
     options |= {
         "movers": movers,
         "test_part": settings.training.split.model_dump(mode="json") if test_part else None,
@@ -143,175 +151,6 @@ def flow(
     print(_json(report)) if as_json else _print(report)
     if plots is not None:
         _draw(plots, measurement, chosen, truths, max_pairs, {name: path for name, path in named if path is not None})
-
-
-def _require_places(*places: Path | None) -> None:
-    """Find out before the measurement that a result could not be written, or would be written over another."""
-    from viflow_anomaly.errors import ConfigError
-
-    *files, plots = places
-    given = [path.resolve() for path in places if path is not None]
-    for path in [path for path in files if path is not None and path.is_dir()]:
-        raise ConfigError(f"{path}: expected the name of a file to write, found a directory", code="output_unusable")
-    if plots is not None and plots.exists() and not plots.is_dir():
-        raise ConfigError(f"{plots}: expected a directory for pictures, found a file", code="output_unusable")
-    if len(set(given)) < len(given):
-        raise ConfigError(f"expected places of their own for each result, found {given}", code="output_unusable")
-
-
-def _numbers(text: str) -> list[int]:
-    """Raises: InvalidInputError: ``look_ahead_out_of_range``."""
-    from viflow_anomaly.datasets.pairing import pair_indices
-    from viflow_anomaly.errors import InvalidInputError
-
-    try:
-        numbers = sorted({int(part) for part in text.split(",")})
-    except ValueError as err:
-        raise InvalidInputError(
-            f"look_aheads: expected numbers between 1 and 4, comma-separated, found {text!r}",
-            code="look_ahead_out_of_range",
-            field="look_aheads",
-        ) from err
-    pair_indices(0, numbers)
-    return numbers
-
-
-def _checkpoints(texts: Sequence[str] | None, settings: Settings) -> list[tuple[str | None, Path | None]]:
-    """(name, path) of each; no path is the bundled model."""
-    if texts is None:
-        return [(None, settings.checkpoint)]
-    if list(texts) == [NONE]:
-        return []
-    pairs = [_named(text) for text in texts]
-    return [(name, Path(path)) for name, path in pairs]
-
-
-def _named(text: str) -> tuple[str | None, str]:
-    """NAME=VALUE, or VALUE alone; a path may hold an equals sign behind a slash."""
-    name, equals, value = text.partition("=")
-    return (name, value) if equals and name and "/" not in name else (None, text)
-
-
-def _truths(
-    recordings: Sequence[Path], look_aheads: Sequence[int], ground_truth: Path | None, movers: bool
-) -> Sequence[RecordingTruth | SceneFlowTruth]:
-    from viflow_anomaly.errors import ConfigError
-    from viflow_anomaly.evaluation.flow_truth import RecordingTruth
-    from viflow_anomaly.evaluation.sceneflow_truth import is_scene_flow, open_scene_flow
-
-    if ground_truth is not None and len(recordings) != 1:
-        raise ConfigError(
-            f"--ground-truth: expected one recording with it, found {len(recordings)}",
-            code="ground_truth_ambiguous",
-            field="ground_truth",
-        )
-    truths: list[RecordingTruth | SceneFlowTruth] = []
-    for path in recordings:
-        if is_scene_flow(path):
-            if ground_truth is not None or tuple(look_aheads) != (1,):
-                raise ConfigError(
-                    f"{path}: expected neither --ground-truth nor --look-aheads with KITTI scene flow, whose pairs and "
-                    f"flow are its own, found {ground_truth or list(look_aheads)}",
-                    code="scene_flow_options",
-                    field="look_aheads" if ground_truth is None else "ground_truth",
-                )
-            truths += open_scene_flow(path, movers=movers)
-        else:
-            truths.append(RecordingTruth(path, look_aheads, ground_truth=ground_truth, movers=movers))
-    names = [truth.sequence for truth in truths]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ConfigError(
-            f"recordings: expected folders of different names, by which they are told apart, found {twice[0]!r} twice",
-            code="sequence_names",
-            field="recordings",
-        )
-    return truths
-
-
-def _test_parts(
-    truths: Sequence[RecordingTruth | SceneFlowTruth],
-    named: Sequence[tuple[str | None, Path | None]],
-    settings: Settings,
-) -> Sequence[FlowTruth]:
-    """What the split keeps for the test; every checkpoint must have been trained with that very split."""
-    from viflow_anomaly.checkpoint_record import bundled_checkpoint, read_checkpoint
-    from viflow_anomaly.errors import ConfigError
-    from viflow_anomaly.evaluation.flow_truth import RecordingTruth, TestPart
-
-    split = settings.training.split
-    if split.rule == "none":
-        raise ConfigError(
-            "--test-part: expected the split that the training had (--set training.split.rule=blocks), found none",
-            code="split_rule_unknown",
-            field="training.split.rule",
-        )
-    if not all(isinstance(truth, RecordingTruth) for truth in truths):
-        raise ConfigError(
-            "--test-part: expected recordings, found KITTI scene flow, which is a test of its own",
-            code="scene_flow_options",
-            field="training.split",
-        )
-    for _, path in named:
-        checkpoint = path or bundled_checkpoint()
-        trained = read_checkpoint(checkpoint)[1].provenance.get("training", {}).get("split")
-        if trained != split.model_dump(mode="json"):
-            raise ConfigError(
-                f"--test-part: expected the split that {checkpoint} was trained with, {trained}, "
-                f"found {split.model_dump(mode='json')}",
-                code="split_differs",
-                field="training.split",
-            )
-    return [TestPart(truth, split) if isinstance(truth, RecordingTruth) else truth for truth in truths]
-
-
-def _baselines(text: str) -> tuple[list[FlowMethod], list[str]]:
-    from viflow_anomaly.evaluation.flow_baselines import choose_baselines
-
-    if text == NONE:
-        return [], []
-    chosen = choose_baselines(None if text == DEFAULT else [part.strip() for part in text.split(",")])
-    return list(chosen.methods), chosen.left_out
-
-
-def _result_files(texts: Sequence[str], truths: Sequence[FlowTruth], max_pairs: int | None) -> list[FlowMethod]:
-    from viflow_anomaly.errors import ConfigError
-    from viflow_anomaly.evaluation.flow_results import ResultFiles
-    from viflow_anomaly.evaluation.flow_truth import spread
-
-    names = [truth.name(index) for truth, index in spread(truths, max_pairs)]
-    methods: list[FlowMethod] = []
-    for text in texts:
-        name, folder = _named(text)
-        if name is None:
-            raise ConfigError(f"--results: expected NAME=DIR, found {text!r}", code="results_unnamed", field="results")
-        methods.append(ResultFiles(name, Path(folder), names))
-    return methods
-
-
-def _networks(named: Sequence[tuple[str | None, Path | None]], settings: Settings) -> list[NetworkMethod]:
-    from viflow_anomaly.evaluation.flow_methods import network_methods
-    from viflow_anomaly.runtime.loading import load_runtime
-
-    methods = []
-    for name, path in named:
-        runtime, record = load_runtime(path, runtime=settings.runtime, device=settings.device, threads=settings.threads)
-        methods += network_methods(name or record.name, runtime, record, settings.detector.correction)
-    return methods
-
-
-def _require_distinct(methods: Sequence[FlowMethod]) -> None:
-    from viflow_anomaly.errors import ConfigError
-
-    names = [method.about.name for method in methods]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice or not names:
-        found = f"{twice[0]!r} twice" if twice else "none"
-        raise ConfigError(
-            f"methods: expected something to measure under names that differ (--checkpoint NAME=PATH), found {found}",
-            code="method_names",
-            field="checkpoint",
-        )
 
 
 def _write(report: dict[str, Any], out: Path | None, markdown: Path | None, latex: Path | None) -> None:
