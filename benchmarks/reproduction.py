@@ -137,7 +137,7 @@ def measure_rig(data: Path, rig: str, out: Path, *, extra: Sequence[str]) -> dic
     files = ["--out", out / f"{rig}.json", "--markdown", out / f"{rig}.md", "--latex", out / f"{rig}.tex"]
     chosen = [part for one in (*checkpoints, *extra) for part in ("--checkpoint", one)]
     held_out = sorted((data / "held-out").glob(f"{rig}_*"))
-    call(command("evaluate", "flow", *held_out, *chosen, *options, *files, "--plots", out / "figures"))
+    call(command("evaluate", "flow", *held_out, *chosen, *options, *files, "--plots", out / "figures" / rig))
     report: dict[str, Any] = json.loads((out / f"{rig}.json").read_text(encoding="utf-8"))
     return report
 

@@ -12,7 +12,7 @@ from worlds import make_world
 
 from viflow_anomaly.config import MotorSource
 from viflow_anomaly.evaluation import flow_figures
-from viflow_anomaly.evaluation.flow_figures import draw_flow_figures, flow_points, paper_points
+from viflow_anomaly.evaluation.flow_figures import best_of_each_series, draw_flow_figures, flow_points, paper_points
 from viflow_anomaly.evaluation.flow_methods import MethodAbout, NoEstimateError
 from viflow_anomaly.evaluation.flow_run import measure_flow_methods
 from viflow_anomaly.evaluation.flow_truth import PairName, RecordingTruth
@@ -107,3 +107,9 @@ def test_the_papers_points() -> None:
     points = paper_points("euroc")
     assert points[-1] == FlowPoint("VIFlow-IMU+SFFMS", "VIFlow-IMU+SFFMS K=8", 3.29, 8, 8.5)
     assert paper_points("kitti")[0] == FlowPoint("FlowNetC", "FlowNetC", 4.0, None, 88.7)
+
+
+def test_a_chart_of_many_points_shows_the_best_of_each_series() -> None:
+    many = [FlowPoint(f"series {k % 3}", f"point {k}", 20.0 - k, runtime_ms=1.0 + k) for k in range(15)]
+    assert [point.label for point in best_of_each_series(many)] == ["point 12", "point 13", "point 14"]
+    assert best_of_each_series(many[:14]) == many[:14]

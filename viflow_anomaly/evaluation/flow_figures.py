@@ -18,6 +18,7 @@ from viflow_anomaly.evaluation.plot_style import SavedPicture, file_name
 from viflow_anomaly.evaluation.plots import FlowPoint, epe_by_hypotheses, epe_by_runtime, hypothesis_wins
 from viflow_anomaly.geometry import Float32Array
 
+MAX_POINTS = 14
 MAX_NETWORKS, MAX_PANELS = 4, 7
 """Methods in one flow picture, the best of each kind: beyond that panels would be too small to read."""
 
@@ -93,6 +94,18 @@ def _best_methods(methods: Sequence[FlowMethod], by_method: ByMethod) -> list[Fl
     return (networks + [method for method in ranked if method.about.kind != "network"])[:MAX_PANELS]
 
 
+def best_of_each_series(points: Sequence[FlowPoint]) -> list[FlowPoint]:
+    """All points, or the most accurate of each series where there are more than a chart's list has room for."""
+    timed = [point for point in points if point.runtime_ms]
+    if len(timed) <= MAX_POINTS:
+        return list(points)
+    best: dict[str, FlowPoint] = {}
+    for point in timed:
+        if point.series not in best or point.epe_px < best[point.series].epe_px:
+            best[point.series] = point
+    return list(best.values())
+
+
 def _from_the_middle(chosen: Sequence[tuple[FlowTruth, int]]) -> dict[str, list[tuple[FlowTruth, int]]]:
     """The pairs of each group, the one in the middle first: it may be one that cannot be measured."""
     groups: dict[str, list[tuple[FlowTruth, int]]] = {}
@@ -134,7 +147,9 @@ def _draw_charts(folder: Path, name: str, methods: Sequence[MethodAbout], by_met
     points = flow_points(methods, by_method)
     pictures = []
     if any(point.runtime_ms for point in points):
-        pictures.append(epe_by_runtime(points, folder / f"epe-runtime-{file_name(name)}", title=name))
+        pictures.append(
+            epe_by_runtime(best_of_each_series(points), folder / f"epe-runtime-{file_name(name)}", title=name)
+        )
     if len({point.hypotheses for point in points if point.hypotheses is not None}) > 1:
         pictures.append(epe_by_hypotheses(points, folder / f"epe-hypotheses-{file_name(name)}", title=name))
     return pictures
