@@ -35,6 +35,7 @@ from viflow_anomaly.config import ImageLimits, RuntimeName
 from viflow_anomaly.detection import ImageSize, rois_from_regions
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import ViflowError
+from viflow_anomaly.evaluation.flow_report import cpu_model
 from viflow_anomaly.geometry import Float32Array, pixel_grid, unproject_pixels
 from viflow_anomaly.model_input import prepare
 from viflow_anomaly.prediction import correct
@@ -176,14 +177,6 @@ def measure(case: Case, detector: AnomalyDetector, stages: Stages, *, repeats: i
         "status": found.status,
         "rois": len(found.rois),
     }
-
-
-def cpu_model() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor() or "unknown"
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 def uncommitted_changes() -> bool | None:

@@ -19,14 +19,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from machine import circumstances
-
 from viflow_anomaly.checkpoint_record import write_atomically
 from viflow_anomaly.config import TrackingConfig
 from viflow_anomaly.detection import OWN_VELOCITY_NAMES, Detection
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.evaluation.detection_scores import MIN_IOU, DetectionScores, ScoredBox, iou
-from viflow_anomaly.evaluation.endpoint_error import open_with_ground_truth
+from viflow_anomaly.evaluation.flow_report import circumstances
+from viflow_anomaly.evaluation.flow_truth import RecordingTruth
 from viflow_anomaly.evaluation.labelled_pairs import Labels, labels_of
 from viflow_anomaly.tracking import Tracker, TrackingState
 
@@ -80,12 +79,13 @@ class Identity:
 
 def judge(detector: AnomalyDetector, path: Path) -> list[Judged]:
     """Every pair of a sequence, untracked."""
-    pairs, truth = open_with_ground_truth(path, motor_source=detector.motor_source)
+    pairs = RecordingTruth(path)
+    truth = pairs.ground_truth
     rows = []
     for index in range(len(pairs)):
-        source_ns = pairs.stamps(index)[0]
+        source_ns = pairs.name(index).source_timestamp_ns
         ids = tuple(thing.instance_id for thing in truth.objects(source_ns))
-        rows.append(Judged(detector.detect(pairs[index]), labels_of(truth, source_ns), ids))
+        rows.append(Judged(detector.detect(pairs.pair(index, detector.motor_source)), labels_of(truth, source_ns), ids))
     return rows
 
 
@@ -105,12 +105,12 @@ def scores(sequences: Iterable[Sequence[Judged]]) -> dict[str, Any]:
     over_all, motion = DetectionScores(), DetectionScores()
     for row in (row for rows in sequences for row in rows):
         rois = [(ScoredBox(roi.bbox, roi.score), roi.label) for roi in row.detection.rois]
-        over_all.add_frame([box for box, _ in rois], row.labels)
-        motion.add_frame([box for box, label in rois if label == "independent_motion"], row.labels)
+        seconds = (row.detection.target_timestamp_ns - row.detection.source_timestamp_ns) * 1e-9
+        over_all.add_frame([box for box, _ in rois], row.labels, seconds)
+        motion.add_frame([box for box, label in rois if label == "independent_motion"], row.labels, seconds)
     summary = over_all.summary()
     kept = ("roi_ap", "recall_at_0.1_false_alarms", "false_alarms_per_frame")
-    recall = sum(one.hit for one in motion.judged) / max(1, motion.movers)
-    return {"recall": round(recall, 3)} | {name: summary[name] for name in kept}
+    return {"recall": motion.summary()["recall"]} | {name: summary[name] for name in kept}
 
 
 def milliseconds(sequences: Sequence[Sequence[Judged]]) -> dict[str, float]:

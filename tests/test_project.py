@@ -179,3 +179,12 @@ def test_the_recipe_replaces_the_model_that_is_loaded() -> None:
     assert kinds == {".safetensors", ".json", ".onnx", ".md"}
     assert load_checkpoint().record.sha256 in (weights / f"{BUNDLED_NAME}.md").read_text(encoding="utf-8")
     assert load_runtime(None).record.name == BUNDLED_NAME
+
+
+@pytest.mark.parametrize("script", sorted(path.name for path in (ROOT / "benchmarks").glob("*.py")))
+def test_every_benchmark_starts(script: str) -> None:
+    done = subprocess.run(
+        [sys.executable, ROOT / "benchmarks" / script, "--help"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("usage: ")

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
@@ -15,6 +17,8 @@ from viflow_anomaly.cli.progress import stderr_progress
 if TYPE_CHECKING:
     from viflow_anomaly.ground_truth.euroc_room import RoomSummary
     from viflow_anomaly.ground_truth.kitti_lidar import LidarSummary
+
+Summary = TypeVar("Summary", "RoomSummary", "LidarSummary")
 
 Out = Annotated[
     Path | None,
@@ -26,6 +30,19 @@ Overwrite = Annotated[
 Camera = Annotated[
     str | None, typer.Option(metavar="NAME", help="Which of several cameras: cam1, image_03.", show_default=False)
 ]
+
+
+def _rendered(things: str, render: Callable[..., Summary], as_json: bool) -> Summary:
+    """Render under a progress bar that counts ``things``, on one thread; print the summary where JSON is wanted."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    with stderr_progress() as progress:
+        task = progress.add_task(things, total=None)
+        summary = render(on_progress=lambda done, total: progress.update(task, completed=done, total=total))
+    if as_json:
+        print(json.dumps(asdict(summary) | {"folder": str(summary.folder)}, indent=2))
+    return summary
 
 
 def euroc(
@@ -58,25 +75,11 @@ def euroc(
 
       viflow-anomaly groundtruth euroc V1_01_easy --out runs/truth/V1_01_easy --trajectory V1_01_easy.csv
     """
-    import cv2
-
     from viflow_anomaly.ground_truth.euroc_room import render_room
 
-    cv2.setNumThreads(1)
-    with stderr_progress() as progress:
-        task = progress.add_task("frames", total=None)
-        summary = render_room(
-            directory,
-            out=out,
-            cloud=cloud,
-            trajectory=trajectory,
-            camera=camera,
-            overwrite=overwrite,
-            on_progress=lambda done, total: progress.update(task, completed=done, total=total),
-        )
-    if as_json:
-        print(json.dumps(asdict(summary) | {"folder": str(summary.folder)}, indent=2))
-    else:
+    of_room = partial(render_room, directory, out=out, cloud=cloud, trajectory=trajectory)
+    summary = _rendered("frames", partial(of_room, camera=camera, overwrite=overwrite), as_json)
+    if not as_json:
         _say_room(summary)
 
 
@@ -105,23 +108,10 @@ def kitti(
 
       viflow-anomaly groundtruth kitti 2011_09_26/2011_09_26_drive_0005_sync --out runs/truth/0005
     """
-    import cv2
-
     from viflow_anomaly.ground_truth.kitti_lidar import render_lidar
 
-    cv2.setNumThreads(1)
-    with stderr_progress() as progress:
-        task = progress.add_task("scans", total=None)
-        summary = render_lidar(
-            drive,
-            out=out,
-            camera=camera,
-            overwrite=overwrite,
-            on_progress=lambda done, total: progress.update(task, completed=done, total=total),
-        )
-    if as_json:
-        print(json.dumps(asdict(summary) | {"folder": str(summary.folder)}, indent=2))
-    else:
+    summary = _rendered("scans", partial(render_lidar, drive, out=out, camera=camera, overwrite=overwrite), as_json)
+    if not as_json:
         _say_lidar(summary)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from viflow_anomaly.config import CorrectionConfig, ModelConfig
 from viflow_anomaly.errors import DatasetError
+from viflow_anomaly.evaluation.flow_run import group_of
 from viflow_anomaly.evaluation.flow_truth import FlowTruth, RecordingTruth, spread
 from viflow_anomaly.geometry import Float32Array, pixel_grid
 from viflow_anomaly.model_input import prepare
@@ -63,7 +64,7 @@ class EndpointErrors:
 
     def per_group(self) -> dict[str, EndpointErrors]:
         """The errors of each group of sequences: the name up to its first underscore (the simulator's rig)."""
-        return self._split(lambda pair: pair.sequence.split("_", 1)[0])
+        return self._split(lambda pair: group_of(pair.sequence))
 
     def _split(self, key: Callable[[PairError], str]) -> dict[str, EndpointErrors]:
         names = sorted({key(pair) for pair in self.pairs})
