@@ -43,6 +43,7 @@ class Correction(NamedTuple):
         flow_px: [h, w, 2] float32.
         motion: the corrected camera motion, None where the network gives flow only.
         inverse_depth: [h, w] as refined, None where the network gives flow only.
+        log_depth_ratio: [h, w] logarithm of the refined over the predicted inverse depth, None likewise.
         inlier_share: confident cells that agree with ``flow_px``, 0..1; 0 where too little was confident.
         shift_px: how far the correction moved the prediction, |du| + |dv|, mean over cells.
         converged: False: nothing to measure, or the prediction was no worse; it stands as it was.
@@ -54,6 +55,7 @@ class Correction(NamedTuple):
     shift_px: float
     converged: bool
     inverse_depth: Float32Array | None = None
+    log_depth_ratio: Float32Array | None = None
 
 
 def rigid_flow_px(
@@ -117,17 +119,36 @@ def correct_motion(
         motion = RigidMotion(so3_exp(step[:3]) @ motion.rotation, motion.translation + step[3:])
     before = rigid_flow_px(rays, inverse_depth, start, focal_px)
     after = rigid_flow_px(rays, inverse_depth, motion, focal_px)
-    corrected = _accepted(before, after, measured, config, start, motion)._replace(inverse_depth=inverse_depth)
+    corrected = _accepted(before, after, measured, config, start, motion)
+    corrected = corrected._replace(inverse_depth=inverse_depth, log_depth_ratio=np.zeros_like(inverse_depth))
     if not corrected.converged or not config.depth_rounds:
         return corrected
-    refined = _refined_depth(rays, inverse_depth, motion, measured, focal_px, config)
+    log_ratio = _log_depth_ratio(rays, inverse_depth, motion, measured, focal_px, config)
+    refined = np.asarray(inverse_depth * np.exp(log_ratio), dtype=np.float32)
     flow_px = rigid_flow_px(rays, refined, motion, focal_px)
     share, _ = _inlier_share(flow_px, measured, config)
     shift_px = _shift_px(before, flow_px, measured, config)
-    return corrected._replace(flow_px=flow_px, inlier_share=share, shift_px=shift_px, inverse_depth=refined)
+    return corrected._replace(
+        flow_px=flow_px, inlier_share=share, shift_px=shift_px, inverse_depth=refined, log_depth_ratio=log_ratio
+    )
 
 
-def _refined_depth(
+def parallax_slope(rays: Float32Array, inverse_depth: Float32Array, motion: RigidMotion) -> Float32Array:
+    """[h, w, 2] derivative of the static flow by the logarithm of the inverse depth, in focal lengths.
+
+    Its direction is that of the epipolar line; its length is the parallax that a point at this depth shows.
+    """
+    x, y = rays[..., 0], rays[..., 1]
+    return _slope(_moved(x, y, inverse_depth, motion), motion)
+
+
+def _slope(moved: tuple[Float32Array, Float32Array, Float32Array], motion: RigidMotion) -> Float32Array:
+    x, y, nearness = moved
+    t = motion.translation.astype(np.float32)
+    return np.stack([nearness * (t[0] - x * t[2]), nearness * (t[1] - y * t[2])], axis=-1)
+
+
+def _log_depth_ratio(
     rays: Float32Array,
     inverse_depth: Float32Array,
     motion: RigidMotion,
@@ -135,17 +156,15 @@ def _refined_depth(
     focal_px: float,
     config: CorrectionConfig,
 ) -> Float32Array:
-    """[h, w] inverse depth that explains the measured parallax better, see ``depth_refinement``."""
+    """[h, w] what the inverse depth's logarithm changes by to explain the parallax, see ``depth_refinement``."""
     x, y = np.ascontiguousarray(rays[..., 0]), np.ascontiguousarray(rays[..., 1])
-    t = motion.translation.astype(np.float32)
     goal = measured.flow_px / np.float32(focal_px) + rays
     log_ratio = np.zeros_like(inverse_depth)
     for _ in range(config.depth_rounds):
-        moved_x, moved_y, nearness = _moved(x, y, inverse_depth * np.exp(log_ratio), motion)
-        slope = np.stack([nearness * (t[0] - moved_x * t[2]), nearness * (t[1] - moved_y * t[2])], axis=-1)
-        parallax = Parallax(goal - np.stack([moved_x, moved_y], axis=-1), slope)
+        moved = _moved(x, y, inverse_depth * np.exp(log_ratio), motion)
+        parallax = Parallax(goal - np.stack(moved[:2], axis=-1), _slope(moved, motion))
         log_ratio = log_depth_step(parallax, measured, log_ratio, config.tolerance_px / focal_px)
-    return np.asarray(inverse_depth * np.exp(log_ratio), dtype=np.float32)
+    return log_ratio
 
 
 def _fill_jacobian(jacobian: Float32Array, x: Float32Array, y: Float32Array, nearness: Float32Array) -> None:

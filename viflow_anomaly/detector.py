@@ -27,7 +27,13 @@ from viflow_anomaly.geometry import Float32Array, pixel_grid
 from viflow_anomaly.model_input import ModelInput, prepare
 from viflow_anomaly.prediction import PredictedFlow, predict_flow
 from viflow_anomaly.regions import find_regions
-from viflow_anomaly.residual import compensate_exposure, photometric_residual, reconstruct, texture_normalised
+from viflow_anomaly.residual import (
+    compensate_exposure,
+    half_range_gray,
+    photometric_residual,
+    reconstruct,
+    texture_normalised,
+)
 from viflow_anomaly.runtime.interface import Runtime
 from viflow_anomaly.runtime.loading import load_runtime
 from viflow_anomaly.sensor_data import FramePair
@@ -148,7 +154,8 @@ class AnomalyDetector:
         if (analyzed := model_input.view.analyzed()) is not None:
             inside &= analyzed
         residual = self._residual(pair, model_input, predicted, reconstruction, inside)
-        evidence = texture_normalised(residual, pair.source.image, self.config.regions.texture_softening_gray)
+        half_range = half_range_gray(pair.source.image)
+        evidence = texture_normalised(residual, half_range, self.config.regions.texture_softening_gray)
         inferred = time.perf_counter()
         x, y, region_width, region_height = model_input.view.region()
         summary = _summary(residual, inside, self.config.min_overlap, region_width * region_height)

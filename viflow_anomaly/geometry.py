@@ -5,13 +5,13 @@ Frames: camera x right, y down, z forward. ``T_a_b`` maps coordinates in b to a.
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from viflow_anomaly.array_cache import MEBIBYTE, ArrayCache
 from viflow_anomaly.sensor_data import Float64Array, PinholeCamera
 
 Float32Array = NDArray[np.float32]
@@ -60,12 +60,19 @@ def sample_bilinear(array: NDArray[Any], at_px: Float32Array, *, border: int = c
     )
 
 
-@lru_cache(maxsize=32)
-def small_pixel_grid(height: int, width: int) -> Float32Array:
-    """Read-only ``pixel_grid`` of a view, made once; for images of any size it would hold too much."""
-    grid = pixel_grid(height, width)
-    grid.setflags(write=False)
-    return grid
+# An image of the largest size that the default limits allow (16 Mi pixels) fits into it.
+_GRIDS: ArrayCache[Float32Array] = ArrayCache(160 * MEBIBYTE)
+
+
+def cached_pixel_grid(height: int, width: int) -> Float32Array:
+    """Read-only ``pixel_grid``, made once."""
+
+    def make() -> Float32Array:
+        grid = pixel_grid(height, width)
+        grid.setflags(write=False)
+        return grid
+
+    return _GRIDS.get((height, width), make, lambda grid: grid.nbytes)
 
 
 def _distort(

@@ -66,6 +66,12 @@ class LensMaps:
         flow = np.asarray(target - maps.source, dtype=np.float32)
         return np.asarray(sample_bilinear(flow, maps.cells_of_source), dtype=np.float32)
 
+    def cells_of_blocks(self, shape: tuple[int, ...], stride: int, block_px: int) -> Float32Array:
+        """[rows, columns, 2]: flow cell of the middle of each block of ``block_px`` source pixels."""
+        cells = self._cell_maps(shape, stride).cells_of_source
+        rows, columns = (np.minimum(np.arange(0, side, block_px) + block_px // 2, side - 1) for side in cells.shape[:2])
+        return np.asarray(cells[np.ix_(rows, columns)])
+
     def _cell_maps(self, shape: tuple[int, ...], stride: int) -> _CellMaps:
         """Made once; two threads that make the same maps make the same values."""
         maps = self._by_stride.get(stride)

@@ -6,12 +6,12 @@ The measurement corrects the network's prediction (``correction``); it never rep
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
-from viflow_anomaly.geometry import Float32Array, sample_bilinear, small_pixel_grid
+from viflow_anomaly.geometry import Float32Array, cached_pixel_grid, sample_bilinear
 from viflow_anomaly.sensor_data import Uint8Array
 
 TEXTURE_GRAY2 = 2.0
@@ -67,17 +67,12 @@ def measure_flow(
     cells = (width // stride, height // stride)
     if min(height, width) < MIN_SIDE_PX:
         return MeasuredFlow(np.zeros((*cells[::-1], 2), np.float32), np.zeros(cells[::-1], np.float32), stride)
-    fast, slow = cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST, cv2.DISOPTICAL_FLOW_PRESET_MEDIUM
-    search = cv2.DISOpticalFlow_create(slow if thorough else fast)  # type: ignore[attr-defined]
-    search.setFinestScale(FINEST_SCALE)
-    if not thorough:
-        search.setPatchStride(PATCH_STRIDE_PX)
-        search.setGradientDescentIterations(DESCENT_STEPS)
+    search = _thorough_search() if thorough else _fast_search()
     if around is None:
         flow = search.calc(source, target, None)
     else:
         guess = cv2.resize(around, (width, height), interpolation=cv2.INTER_LINEAR)
-        grid = small_pixel_grid(height, width)
+        grid = cached_pixel_grid(height, width)
         flow = search.calc(source, sample_bilinear(target, grid + guess), None)
         flow = flow + sample_bilinear(guess, grid + flow)  # where a pixel of the moved target came from
     flow_px = np.asarray(cv2.resize(flow, cells, interpolation=cv2.INTER_AREA), dtype=np.float32)
@@ -86,19 +81,26 @@ def measure_flow(
 
 def _confidence(source: Uint8Array, target: Uint8Array, flow_px: Float32Array, cells: tuple[int, int]) -> Float32Array:
     """[h, w] in 0..1: texture to measure by, and photometric agreement after the flow, on the halved views."""
-    height, width = source.shape
-    half = (width // 2, height // 2)
-    small_source, small_target = (
-        np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), dtype=np.uint8) for image in (source, target)
-    )
-    at = cv2.resize(flow_px, half, interpolation=cv2.INTER_NEAREST) * np.float32(0.5) + small_pixel_grid(
-        half[1], half[0]
-    )
-    matched = sample_bilinear(small_target, at, border=cv2.BORDER_CONSTANT)
-    mismatch = cv2.resize(cv2.absdiff(matched, small_source), cells, interpolation=cv2.INTER_AREA)
-    mismatch = mismatch * np.float32(1 / MISMATCH_GRAY)
+    small_source, small_target = (_halved(image) for image in (source, target))
+    mismatch = _mismatch_gray(small_source, small_target, flow_px, cells) * np.float32(1 / MISMATCH_GRAY)
     texture = _texture(small_source, cells)
     return np.asarray(texture / ((texture + np.float32(TEXTURE_GRAY2)) * (1 + mismatch * mismatch)), dtype=np.float32)
+
+
+def _halved(image: Uint8Array) -> Uint8Array:
+    half = (image.shape[1] // 2, image.shape[0] // 2)
+    return np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _mismatch_gray(
+    small_source: Uint8Array, small_target: Uint8Array, flow_px: Float32Array, cells: tuple[int, int]
+) -> Float32Array:
+    """[h, w] gray levels by which halved images differ after a flow, which is in whole pixels."""
+    height, width = small_source.shape
+    at = cv2.resize(flow_px, (width, height), interpolation=cv2.INTER_NEAREST) * np.float32(0.5)
+    matched = sample_bilinear(small_target, at + cached_pixel_grid(height, width), border=cv2.BORDER_CONSTANT)
+    difference = cv2.absdiff(matched, small_source)
+    return np.asarray(cv2.resize(difference, cells, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
 def _texture(image: Uint8Array, cells: tuple[int, int]) -> Float32Array:
@@ -107,3 +109,49 @@ def _texture(image: Uint8Array, cells: tuple[int, int]) -> Float32Array:
     # OpenCV scales gradients by 1 / (2^(ksize - 1) * block * 255) before it sums their products over the block.
     gray2 = (4 * WINDOW_PX * 255) ** 2 / (WINDOW_PX * WINDOW_PX) / 64
     return np.asarray(cv2.resize(smaller, cells, interpolation=cv2.INTER_AREA), dtype=np.float32) * np.float32(gray2)
+
+
+class RemainingFlow(NamedTuple):
+    """What still moves between two images that should be alike, on blocks [h, w].
+
+    Attributes:
+        flow_px: [h, w, 2] float32.
+        mismatch_gray: how far the images differ after it.
+        texture_gray2: to measure by, see ``TEXTURE_GRAY2``.
+    """
+
+    flow_px: Float32Array
+    mismatch_gray: Float32Array
+    texture_gray2: Float32Array
+
+
+def measure_remaining_flow(source: Uint8Array, rebuilt: Uint8Array, *, block_px: int) -> RemainingFlow:
+    """Flow from the source to what was rebuilt of it: zero where the prediction is right.
+
+    Args:
+        source, rebuilt: [H, W]; sides are multiples of ``block_px``, even, and at least ``MIN_SIDE_PX``.
+        block_px: pixels for one value of the result.
+    """
+    blocks = (source.shape[1] // block_px, source.shape[0] // block_px)
+    search = _fast_search()
+    flow = np.asarray(search.calc(source, rebuilt, None), dtype=np.float32)
+    small_source, small_rebuilt = (_halved(image) for image in (source, rebuilt))
+    return RemainingFlow(
+        np.asarray(cv2.resize(flow, blocks, interpolation=cv2.INTER_AREA), dtype=np.float32),
+        _mismatch_gray(small_source, small_rebuilt, flow, blocks),
+        _texture(small_source, blocks),
+    )
+
+
+def _thorough_search() -> Any:
+    search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)  # type: ignore[attr-defined]
+    search.setFinestScale(FINEST_SCALE)
+    return search
+
+
+def _fast_search() -> Any:
+    search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)  # type: ignore[attr-defined]
+    search.setFinestScale(FINEST_SCALE)
+    search.setPatchStride(PATCH_STRIDE_PX)
+    search.setGradientDescentIterations(DESCENT_STEPS)
+    return search

@@ -10,7 +10,7 @@ import numpy as np
 
 from viflow_anomaly.config import CorrectionConfig
 from viflow_anomaly.correction import Correction, correct_flow, correct_motion
-from viflow_anomaly.geometry import Float32Array, pixel_grid, sample_bilinear, small_pixel_grid
+from viflow_anomaly.geometry import Float32Array, cached_pixel_grid, pixel_grid, sample_bilinear
 from viflow_anomaly.measured_flow import MeasuredFlow, measure_flow
 from viflow_anomaly.model_input import ModelInput
 from viflow_anomaly.runtime.interface import Hypotheses, Runtime
@@ -105,7 +105,7 @@ def choose_hypothesis(hypotheses: Hypotheses, source: Uint8Array, target: Uint8A
     size = (source.shape[1] // shrink, source.shape[0] // shrink)
     small_source, small_target = (_normalised(image, size, shrink) for image in (source, target))
     at = np.stack([_shrunk(one, size, shrink // stride) for one in flow_px]) * np.float32(1 / shrink)
-    at += small_pixel_grid(size[1], size[0])  # K, h, w, 2
+    at += cached_pixel_grid(size[1], size[0])  # K, h, w, 2
     tall = at.reshape(-1, size[0], 2)
     inside = cv2.inRange(tall, (0.0, 0.0), (size[0] - 1.0, size[1] - 1.0)).reshape(at.shape[:3]) != 0
     sampled = sample_bilinear(small_target, tall).reshape(at.shape[:3])

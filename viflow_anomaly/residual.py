@@ -100,22 +100,27 @@ def compensate_exposure(reconstruction: Float32Array, source: Uint8Array, inside
     return np.asarray(np.where(inside, compensated, reconstruction), dtype=np.float32)
 
 
-def texture_normalised(residual: Float32Array, source: Uint8Array, softening_gray: float) -> Float32Array:
+def half_range_gray(source: Uint8Array) -> Float32Array:
+    """[H, W] float32: half the gray range of the 3x3 pixels around each, what a misplacement of one pixel leaves."""
+    block = np.ones((3, 3), np.uint8)
+    span = cv2.subtract(cv2.dilate(source, block), cv2.erode(source, block)).astype(np.float32)
+    span *= np.float32(0.5)
+    return span
+
+
+def texture_normalised(residual: Float32Array, half_range: Float32Array, softening_gray: float) -> Float32Array:
     """The residual over what a misplacement of one pixel would leave at the same place.
 
-    Half the gray range of the 3x3 pixels around each is that misplacement's residual. Where the source is flat the
-    result is twice the residual, at a range of 2 ``softening_gray`` it is the residual, on strong edges less: errors
-    of the prediction show on edges, things that moved show on plain surfaces, too.
+    Where the source is flat the result is twice the residual, at a half range of ``softening_gray`` it is the residual,
+    on strong edges less: errors of the prediction show on edges, things that moved show on plain surfaces, too.
 
     Args:
         residual: [H, W] float32 gray levels.
-        source: [H, W] uint8.
+        half_range: [H, W] of the source, ``half_range_gray``.
         softening_gray: 0 gives the residual itself (the paper's).
     """
     if softening_gray == 0:
         return residual
-    block = np.ones((3, 3), np.uint8)
-    half_range = cv2.subtract(cv2.dilate(source, block), cv2.erode(source, block)).astype(np.float32)
-    half_range *= np.float32(0.5 / (2 * softening_gray))
-    half_range += np.float32(0.5)
-    return np.asarray(cv2.divide(residual, half_range), dtype=np.float32)
+    scale = half_range * np.float32(0.5 / softening_gray)
+    scale += np.float32(0.5)
+    return np.asarray(cv2.divide(residual, scale), dtype=np.float32)

@@ -9,30 +9,24 @@ coarsest stride); what lies beyond the source image repeats its border.
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from threading import Lock
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from viflow_anomaly.array_cache import MEBIBYTE, ArrayCache
 from viflow_anomaly.config import ViewConfig
 from viflow_anomaly.errors import InvalidInputError, TooLargeError
-from viflow_anomaly.geometry import Float32Array, pixel_grid, sample_bilinear, unproject_pixels
+from viflow_anomaly.geometry import Float32Array, cached_pixel_grid, sample_bilinear, unproject_pixels
 from viflow_anomaly.lens import LensMaps, lattice_rays, solve_lens_maps
 from viflow_anomaly.sensor_data import DistortionModel, PinholeCamera, Uint8Array
 
 SIDE_MULTIPLE_PX = 32
 MAX_SIDE_PX = 32767
-MEBIBYTE = 1024 * 1024
-CACHE_ENTRY_BYTES = 4096
-"""What is counted for a cached value beside its arrays, so that their number is bounded, too."""
-
-Cached = TypeVar("Cached")
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +98,30 @@ class InternalView:
             ]
             flow = flow_view_px * np.array(self.step_px, dtype=np.float32)
             spread = _sample_affine(flow, scales, offsets, (self.source_width, self.source_height))
-        return np.asarray(cv2.add(spread, _source_grid(self.source_height, self.source_width)), dtype=np.float32)
+        return np.asarray(cv2.add(spread, cached_pixel_grid(self.source_height, self.source_width)), dtype=np.float32)
+
+    def sample_blocks(self, cells: Float32Array, stride: int, block_px: int) -> Float32Array:
+        """What cells of the view (as in ``target_coordinates``) say of the middle of each block of source pixels.
+
+        Args:
+            cells: [h, w, C], C at most 4; anything, not converted.
+            stride: view pixels for one cell.
+            block_px: sides of a block; the first one's corner is the image's.
+
+        Returns:
+            [ceil(H / block_px), ceil(W / block_px), C] float32.
+        """
+        rows, columns = -(-self.source_height // block_px), -(-self.source_width // block_px)
+        if self.lens is not None:
+            at = self.lens.cells_of_blocks(cells.shape[:2], stride, block_px)
+            return np.asarray(sample_bilinear(cells, at), dtype=np.float32)
+        scales = [1 / (step * stride) for step in self.step_px]
+        offsets = [
+            (middle + 0.5) / stride - 0.5 - center * scale + (block_px - 1) / 2 * scale
+            for center, middle, scale in zip(self.center_px, self.middle_px, scales, strict=True)
+        ]
+        blocks = _sample_affine(cells, [scale * block_px for scale in scales], offsets, (columns, rows))
+        return np.asarray(blocks, dtype=np.float32)
 
     @property
     def held_bytes(self) -> int:
@@ -157,50 +174,8 @@ def _sample_affine(
     return cv2.warpAffine(array, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
 
 
-class ArrayCache(Generic[Cached]):
-    """Values by key; the least recently used ones go while all together take more than ``max_bytes``.
-
-    A value larger than that is made anew each time. Threads may share a cache: values are made outside its lock, and
-    where two threads make the same one, both get the first.
-    """
-
-    def __init__(self, max_bytes: int) -> None:
-        self.max_bytes = max_bytes
-        self.held_bytes = 0
-        self._entries: OrderedDict[Hashable, tuple[Cached, int]] = OrderedDict()
-        self._lock = Lock()
-
-    def get(self, key: Hashable, make: Callable[[], Cached], bytes_of: Callable[[Cached], int]) -> Cached:
-        """The value of ``key``: the one that is held, or what ``make`` gives."""
-        with self._lock:
-            if key in self._entries:
-                self._entries.move_to_end(key)
-                return self._entries[key][0]
-        made = make()
-        size = bytes_of(made) + CACHE_ENTRY_BYTES
-        with self._lock:
-            if key in self._entries:
-                return self._entries[key][0]
-            if size <= self.max_bytes:
-                self._entries[key] = (made, size)
-                self.held_bytes += size
-            while self.held_bytes > self.max_bytes:
-                self.held_bytes -= self._entries.popitem(last=False)[1][1]
-        return made
-
-
-# An image of the largest size that the default limits allow (16 Mi pixels) fits into each.
+# An image of the largest size that the default limits allow (16 Mi pixels) fits into it.
 _VIEWS: ArrayCache[InternalView] = ArrayCache(256 * MEBIBYTE)
-_SOURCE_GRIDS: ArrayCache[Float32Array] = ArrayCache(160 * MEBIBYTE)
-
-
-def _source_grid(height: int, width: int) -> Float32Array:
-    def make() -> Float32Array:
-        grid = pixel_grid(height, width)
-        grid.setflags(write=False)
-        return grid
-
-    return _SOURCE_GRIDS.get((height, width), make, lambda grid: grid.nbytes)
 
 
 def make_view(config: ViewConfig, *, width: int, height: int, camera: PinholeCamera | None) -> InternalView:

@@ -1,0 +1,167 @@
+"""What the evidence head looks at: how the reconstruction differs from the source, and what geometry says of it.
+
+None of the cues is the picture itself. The head learns on simulated scenes; what it must not learn is what movers look
+like there. All cues are bounded to -1..1, so that nothing unheard of reaches the network from a real camera.
+
+Photometric cues are on every source pixel, geometric ones on blocks of ``BLOCK_PX`` pixels: flow is smooth, and the
+measured one is no finer. Of the flow that is left between source and reconstruction, only what lies *across* the
+epipolar line is independent motion for sure; *along* it, a wrong depth looks the same.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from viflow_anomaly.correction import parallax_slope
+from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.measured_flow import measure_remaining_flow
+from viflow_anomaly.prediction import PredictedFlow, view_rays
+from viflow_anomaly.sensor_data import Uint8Array
+from viflow_anomaly.view import InternalView
+
+BLOCK_PX = 4
+PHOTOMETRIC_CUES = ("difference", "normalised residual", "half range")
+GEOMETRIC_CUES = (
+    "remaining flow across",
+    "remaining flow along",
+    "remaining flow",
+    "mismatch after it",
+    "texture",
+    "parallax",
+    "depth correction",
+    "inverse depth",
+    "inside",
+    "predicted flow",
+)
+MIN_PARALLAX_PX = 0.05
+"""Below it an epipolar line has no direction; along is then along x."""
+HALF_GRAY, HALF_NORMALISED_GRAY, HALF_MISMATCH_GRAY = 16.0, 8.0, 8.0
+HALF_REMAINING_PX, HALF_PARALLAX_PX, HALF_FLOW_PX = 1.0, 4.0, 16.0
+HALF_TEXTURE_GRAY2 = 8.0
+"""Values at which a cue is half of its largest: c = v / (|v| + half)."""
+
+
+MIN_INVERSE_DEPTH = 1e-3
+SIDE_MULTIPLE_PX = 32
+"""Images are padded to multiples of it: the coarsest stride of the head."""
+
+
+class EvidenceCues(NamedTuple):
+    """One pair, all values in -1..1. H' and W' are the image's sides, rounded up to multiples of 32.
+
+    Attributes:
+        photometric: [3, H', W'] float32, ``PHOTOMETRIC_CUES``.
+        geometric: [10, H' / 4, W' / 4] float32, ``GEOMETRIC_CUES``.
+    """
+
+    photometric: Float32Array
+    geometric: Float32Array
+
+
+class Reconstructed(NamedTuple):
+    """The source beside what the prediction makes of the target: [H, W] each.
+
+    ``normalised`` is the texture-normalised residual, ``half_range`` what it was normalised by.
+    """
+
+    source: Uint8Array
+    reconstruction: Float32Array
+    inside: NDArray[np.bool_]
+    normalised: Float32Array
+    half_range: Float32Array
+
+
+def evidence_cues(
+    reconstructed: Reconstructed, predicted: PredictedFlow, view: InternalView, *, focal_px: float
+) -> EvidenceCues:
+    """The cues of one pair.
+
+    Args:
+        reconstructed: at the source image's size.
+        predicted: what it was reconstructed with.
+        view: that the prediction is of.
+        focal_px: that the network takes the view for.
+    """
+    source, inside = _padded(reconstructed.source), _padded(reconstructed.inside.astype(np.uint8), outside=True)
+    rebuilt = _padded(cv2.convertScaleAbs(reconstructed.reconstruction))
+    np.copyto(rebuilt, source, where=inside == 0)
+    height, width = source.shape
+    photometric = np.empty((len(PHOTOMETRIC_CUES), height, width), dtype=np.float32)
+    _bound(cv2.subtract(rebuilt, source, dtype=cv2.CV_32F), HALF_GRAY, photometric[0])
+    _bound(_padded(reconstructed.normalised, outside=True), HALF_NORMALISED_GRAY, photometric[1])
+    _bound(_padded(reconstructed.half_range), HALF_GRAY, photometric[2])
+
+    blocks = (width // BLOCK_PX, height // BLOCK_PX)
+    geometric = np.empty((len(GEOMETRIC_CUES), *blocks[::-1]), dtype=np.float32)
+    remaining = measure_remaining_flow(source, rebuilt, block_px=BLOCK_PX)
+    slope, log_ratio, log_depth = _parallax(predicted, view, blocks, focal_px)
+    _split_along(remaining.flow_px, slope, geometric)
+    _bound(remaining.mismatch_gray, HALF_MISMATCH_GRAY, geometric[3])
+    _bound(remaining.texture_gray2, HALF_TEXTURE_GRAY2, geometric[4])
+    np.clip(log_ratio, -1, 1, out=geometric[6])
+    np.clip(log_depth * np.float32(0.5), -1, 1, out=geometric[7])
+    geometric[8] = cv2.resize(inside * np.float32(1), blocks, interpolation=cv2.INTER_AREA)
+    flow_px = _on_blocks(predicted.flow_px, predicted, view, blocks) * np.array(view.step_px, dtype=np.float32)
+    _bound(np.linalg.norm(flow_px, axis=-1), HALF_FLOW_PX, geometric[9])
+    return EvidenceCues(photometric, geometric)
+
+
+def _padded(image: NDArray[Any], *, outside: bool = False) -> NDArray[Any]:
+    """[H', W']; beyond the image its border is repeated, or nothing is (``outside``)."""
+    below, right = (-side % SIDE_MULTIPLE_PX for side in image.shape[:2])
+    if not below and not right:
+        return image
+    border = cv2.BORDER_CONSTANT if outside else cv2.BORDER_REPLICATE
+    return cv2.copyMakeBorder(image, 0, below, 0, right, border)
+
+
+def _bound(values: Float32Array, half: float, out: Float32Array) -> None:
+    """v / (|v| + half), in -1..1."""
+    np.abs(values, out=out)
+    out += np.float32(half)
+    np.divide(values, out, out=out)
+
+
+def _parallax(
+    predicted: PredictedFlow, view: InternalView, blocks: tuple[int, int], focal_px: float
+) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """On blocks: slope [h, w, 2] in source pixels for a change of the inverse depth's logarithm by one, that change
+    [h, w] as the correction made it, and the logarithm itself; zeros where the network gives flow only."""
+    correction, shape = predicted.correction, predicted.flow_px.shape[:2]
+    cells = np.zeros((*shape, 4), dtype=np.float32)
+    if correction is not None and correction.motion is not None and correction.inverse_depth is not None:
+        rays = view_rays(*shape, predicted.stride, view.height, view.width, focal_px)
+        slope = parallax_slope(rays, correction.inverse_depth, correction.motion)
+        np.multiply(slope, np.array(view.step_px, dtype=np.float32) * np.float32(focal_px), out=cells[..., :2])
+        np.log(np.maximum(correction.inverse_depth, MIN_INVERSE_DEPTH), out=cells[..., 3])
+        if correction.log_depth_ratio is not None:
+            cells[..., 2] = correction.log_depth_ratio
+    sampled = _on_blocks(cells, predicted, view, blocks)
+    return sampled[..., :2], sampled[..., 2], sampled[..., 3]
+
+
+def _split_along(flow_px: Float32Array, slope_px: Float32Array, geometric: Float32Array) -> None:
+    """Remaining flow across and along the epipolar line, its length, and the parallax (cues 0, 1, 2 and 5)."""
+    sx, sy = slope_px[..., 0] + np.float32(MIN_PARALLAX_PX), slope_px[..., 1]
+    length = np.sqrt(sx * sx + sy * sy)
+    inverse = 1 / np.maximum(length, np.float32(1e-6))
+    u, v = flow_px[..., 0], flow_px[..., 1]
+    _bound((v * sx - u * sy) * inverse, HALF_REMAINING_PX, geometric[0])
+    _bound((u * sx + v * sy) * inverse, HALF_REMAINING_PX, geometric[1])
+    _bound(np.sqrt(u * u + v * v), HALF_REMAINING_PX, geometric[2])
+    _bound(length, HALF_PARALLAX_PX, geometric[5])
+
+
+def _on_blocks(
+    cells: Float32Array, predicted: PredictedFlow, view: InternalView, blocks: tuple[int, int]
+) -> Float32Array:
+    """[h, w, C] of the padded image; beyond the image its border is repeated."""
+    sampled = view.sample_blocks(cells, predicted.stride, BLOCK_PX)
+    below, right = blocks[1] - sampled.shape[0], blocks[0] - sampled.shape[1]
+    if below or right:
+        sampled = np.asarray(cv2.copyMakeBorder(sampled, 0, below, 0, right, cv2.BORDER_REPLICATE), np.float32)
+    return sampled
