@@ -40,7 +40,7 @@ from viflow_anomaly.geometry import Float32Array, pixel_grid, unproject_pixels
 from viflow_anomaly.model_input import prepare
 from viflow_anomaly.prediction import correct
 from viflow_anomaly.regions import find_regions
-from viflow_anomaly.residual import photometric_residual, reconstruct, texture_normalised
+from viflow_anomaly.residual import half_range_gray, photometric_residual, reconstruct, texture_normalised
 from viflow_anomaly.runtime.loading import load_runtime
 from viflow_anomaly.sensor_data import Frame, FramePair, PinholeCamera, Uint8Array
 
@@ -125,7 +125,7 @@ class Stages:
         clock.append(time.perf_counter())
         height, width = residual.shape
         config = self._config.regions
-        evidence = texture_normalised(residual, pair.source.image, config.texture_softening_gray)
+        evidence = texture_normalised(residual, half_range_gray(pair.source.image), config.texture_softening_gray)
         regions = find_regions(evidence, inside, config, residual=residual).regions
         rois_from_regions(regions, ImageSize(width=width, height=height))
         clock.append(time.perf_counter())

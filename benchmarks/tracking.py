@@ -104,10 +104,10 @@ def scores(sequences: Iterable[Sequence[Judged]]) -> dict[str, Any]:
     """Recall and false alarms of what is labelled as motion, and the curve's figures."""
     over_all, motion = DetectionScores(), DetectionScores()
     for row in (row for rows in sequences for row in rows):
-        rois = [(ScoredBox(roi.bbox, roi.score), roi.label) for roi in row.detection.rois]
+        boxes = [ScoredBox(roi.bbox, roi.score, roi.label == "independent_motion") for roi in row.detection.rois]
         seconds = (row.detection.target_timestamp_ns - row.detection.source_timestamp_ns) * 1e-9
-        over_all.add_frame([box for box, _ in rois], row.labels, seconds)
-        motion.add_frame([box for box, label in rois if label == "independent_motion"], row.labels, seconds)
+        over_all.add_frame(boxes, row.labels, seconds)
+        motion.add_frame([box for box in boxes if box.motion], row.labels, seconds)
     summary = over_all.summary()
     kept = ("roi_ap", "recall_at_0.1_false_alarms", "false_alarms_per_frame")
     return {"recall": motion.summary()["recall"]} | {name: summary[name] for name in kept}

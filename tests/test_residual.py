@@ -8,7 +8,13 @@ from worlds import textured_image
 
 from viflow_anomaly.errors import TooLargeError
 from viflow_anomaly.geometry import pixel_grid
-from viflow_anomaly.residual import compensate_exposure, photometric_residual, reconstruct, texture_normalised
+from viflow_anomaly.residual import (
+    compensate_exposure,
+    half_range_gray,
+    photometric_residual,
+    reconstruct,
+    texture_normalised,
+)
 
 H, W = 40, 56
 IMAGE = textured_image(W, H)
@@ -84,7 +90,7 @@ def test_a_flat_picture_doubles_the_residual_and_a_strong_edge_lowers_it() -> No
     source = np.full((9, 12), 50, np.uint8)
     source[:, 6:] = 250
     residual = np.full((9, 12), 20.0, np.float32)
-    evidence = texture_normalised(residual, source, 10.0)
+    evidence = texture_normalised(residual, half_range_gray(source), 10.0)
     np.testing.assert_allclose(evidence[:, :5], 40.0)
     np.testing.assert_allclose(evidence[:, 5:7], 20.0 / (200 * 0.5 / 20 + 0.5))
     np.testing.assert_allclose(evidence[:, 7:], 40.0)
@@ -93,18 +99,18 @@ def test_a_flat_picture_doubles_the_residual_and_a_strong_edge_lowers_it() -> No
 def test_at_twice_the_softening_the_residual_stays() -> None:
     source = np.zeros((8, 8), np.uint8)
     source[:, ::2] = 20
-    np.testing.assert_allclose(texture_normalised(np.full((8, 8), 7.0, np.float32), source, 10.0), 7.0)
+    np.testing.assert_allclose(texture_normalised(np.full((8, 8), 7.0, np.float32), half_range_gray(source), 10.0), 7.0)
 
 
 def test_without_softening_it_is_the_papers_residual() -> None:
     residual = np.random.default_rng(0).random((H, W), dtype=np.float32)
-    assert texture_normalised(residual, IMAGE, 0.0) is residual
+    assert texture_normalised(residual, half_range_gray(IMAGE), 0.0) is residual
 
 
 def test_a_misplaced_picture_leaves_less_evidence_than_something_new() -> None:
     shifted = np.abs(np.roll(IMAGE, 1, axis=1).astype(np.float32) - IMAGE)
-    evidence = texture_normalised(shifted, IMAGE, 10.0)
-    flat = texture_normalised(shifted, np.full_like(IMAGE, 128), 10.0)
+    evidence = texture_normalised(shifted, half_range_gray(IMAGE), 10.0)
+    flat = texture_normalised(shifted, half_range_gray(np.full_like(IMAGE, 128)), 10.0)
     assert evidence.mean() < 0.7 * flat.mean()
 
 

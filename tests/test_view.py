@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from threading import Barrier
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -14,7 +11,7 @@ from viflow_anomaly.config import ViewConfig
 from viflow_anomaly.errors import InvalidInputError, TooLargeError
 from viflow_anomaly.geometry import pixel_grid, project_rays, unproject_pixels
 from viflow_anomaly.sensor_data import DistortionModel, PinholeCamera
-from viflow_anomaly.view import CACHE_ENTRY_BYTES, SIDE_MULTIPLE_PX, ArrayCache, InternalView, make_view
+from viflow_anomaly.view import SIDE_MULTIPLE_PX, InternalView, make_view
 
 # Steps of 1, 2 and 3 for the sizes below, whatever the defaults are.
 WHOLE = ViewConfig(focal_px=232.0, max_width=416, max_height=416, max_pinhole_width=640, max_pinhole_height=512)
@@ -252,63 +249,6 @@ def test_a_view_says_what_it_holds() -> None:
     tables = view.lens.source_of_view.nbytes + 2 * view.lens.view_of_source.nbytes
     assert view.held_bytes == tables + mask.nbytes
     assert make_view(WHOLE, width=320, height=240, camera=SCALED).held_bytes == 0
-
-
-# --- the cache of what takes long to make
-
-
-def cached(cache: ArrayCache[bytes], key: str, kibibytes: int = 1) -> bytes:
-    return cache.get(key, lambda: bytes(1024 * kibibytes), len)
-
-
-def cache_for(entries: int) -> ArrayCache[bytes]:
-    """Of as many entries of 1 KiB as said."""
-    return ArrayCache(entries * (1024 + CACHE_ENTRY_BYTES))
-
-
-def test_the_least_recently_used_value_goes_first() -> None:
-    cache = cache_for(2)
-    a, b = cached(cache, "a"), cached(cache, "b")
-    assert cached(cache, "a") is a
-    cached(cache, "c")
-    assert cached(cache, "a") is a
-    assert cached(cache, "b") is not b
-
-
-@pytest.mark.parametrize("kibibytes", [1, 5, 10, 11, 40])
-def test_a_cache_never_holds_more_than_its_limit(kibibytes: int) -> None:
-    cache = cache_for(3)
-    for key in "abcabdeaf":
-        assert len(cached(cache, key, kibibytes)) == 1024 * kibibytes
-        assert cache.held_bytes <= cache.max_bytes
-
-
-def test_a_value_beyond_the_limit_drives_no_other_out() -> None:
-    cache = cache_for(2)
-    a = cached(cache, "a")
-    assert cached(cache, "large", 100) is not cached(cache, "large", 100)
-    assert cached(cache, "a") is a
-
-
-def test_threads_that_make_the_same_value_get_the_same_one() -> None:
-    cache, together = cache_for(4), Barrier(4, timeout=30)
-
-    def make() -> bytes:
-        together.wait()  # all four have looked before any has made it
-        return bytes(1024)
-
-    with ThreadPoolExecutor(4) as threads:
-        values = list(threads.map(lambda _: cache.get("a", make, len), range(4)))
-    assert len({id(value) for value in values}) == 1
-    assert cache.held_bytes == 1024 + CACHE_ENTRY_BYTES
-
-
-def test_what_fails_is_not_held() -> None:
-    cache = cache_for(2)
-    with pytest.raises(ZeroDivisionError):
-        cache.get("a", lambda: bytes(1 // 0), len)
-    assert cache.held_bytes == 0
-    assert cached(cache, "a") == bytes(1024)
 
 
 def test_a_long_thin_image_is_shrunk_without_losing_its_rows() -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import label as label_components
 
-from viflow_anomaly.config import RegionConfig, ShapeRuleName
+from viflow_anomaly.config import RegionConfig
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.shape_rule import ShapeLimits, judge_shape, thickness_px
 
@@ -121,7 +121,7 @@ def find_regions(
         max_aspect_ratio=config.max_aspect_ratio,
     )
     regions = [
-        _judge(component, evidence, evidence if residual is None else residual, level, config.shape_rule, limits)
+        _judge(component, evidence, evidence if residual is None else residual, level, config, limits)
         for component in components
     ]
     regions.sort(key=lambda region: (-region.score, region.bbox.y, region.bbox.x))
@@ -202,7 +202,7 @@ def _judge(
     evidence: Float32Array,
     residual: Float32Array,
     level: _Level,
-    rule: ShapeRuleName,
+    config: RegionConfig,
     limits: ShapeLimits,
 ) -> Region:
     y, x = component
@@ -216,11 +216,12 @@ def _judge(
     aspect_ratio = max(box.width, box.height) / min(box.width, box.height)
     contrast = _contrast(evidence_gray, level)
     thickness = thickness_px(mask)
-    shape = judge_shape(rule, mask, thickness, limits)
-    label: RegionLabel = "independent_motion" if shape.passes else "model_error"
+    shape = judge_shape(config.shape_rule, mask, thickness, limits)
+    score = _score(shape.passes, contrast, fill_ratio, shape.nearness_to_band)
+    label: RegionLabel = "independent_motion" if shape.passes and score >= config.motion_score else "model_error"
     return Region(
         label=label,
-        score=_score(label, contrast, fill_ratio, shape.nearness_to_band),
+        score=score,
         bbox=box,
         x_extent_px=box.width,
         y_extent_px=box.height,
@@ -245,12 +246,12 @@ def _contrast(mean_gray: float, level: _Level) -> float:
     return max(0.0, (mean_gray - level.background_gray) / span_gray)
 
 
-def _score(label: RegionLabel, contrast: float, fill_ratio: float, nearness_to_band: float) -> float:
-    """0.5 to 1 for independent motion, 0 to 0.5 for model error; rises with contrast, fill and distance from a band.
+def _score(passes: bool, contrast: float, fill_ratio: float, nearness_to_band: float) -> float:
+    """0.5 to 1 for an extended region, 0 to 0.5 for a band; rises with contrast, fill and distance from a band.
 
-    score = 0.5 [motion] + 0.5 * c / (1 + c) * sqrt(fill) * (1 - b / 2), where b in 0..1 says how near to a band the
+    score = 0.5 [extended] + 0.5 * c / (1 + c) * sqrt(fill) * (1 - b / 2), where b in 0..1 says how near to a band the
     region is (``Shape``). Rounded, so that equal scores tie in the written answer as well.
     """
     shape = 1.0 - 0.5 * min(nearness_to_band, 1.0)
     strength = contrast / (1.0 + contrast) * float(np.sqrt(fill_ratio)) * shape
-    return round((0.5 if label == "independent_motion" else 0.0) + 0.5 * strength, 4)
+    return round((0.5 if passes else 0.0) + 0.5 * strength, 4)

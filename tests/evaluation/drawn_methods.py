@@ -81,5 +81,5 @@ class DrawnMethod:
             for box, score in boxes:
                 evidence[mask_of(box)] = score
                 motion |= mask_of(box) & (score >= 0.5)
-            findings.append(Finding(thresholds, tuple(ScoredBox(*one) for one in boxes), motion))
+            findings.append(Finding(thresholds, tuple(ScoredBox(*one, one[1] >= 0.5) for one in boxes), motion))
         return Judgement(evidence, np.ones(SHAPE, np.bool_), tuple(findings))

@@ -22,7 +22,7 @@ def labels(
 
 
 def box(x: int, y: int, width: int, height: int, score: float) -> ScoredBox:
-    return ScoredBox(BoundingBox(x, y, width, height), score)
+    return ScoredBox(BoundingBox(x, y, width, height), score, score >= 0.5)
 
 
 def scored(*frames: tuple[list[ScoredBox], Labels]) -> DetectionScores:

@@ -100,8 +100,9 @@ class DetectorMethod:
         boxes, motion = [], np.zeros(analysis.inside.shape, np.bool_)
         for roi in analysis.detection.rois:
             box = roi.bbox
-            boxes.append(ScoredBox(BoundingBox(box.x, box.y, box.width, box.height), roi.score))
-            if roi.label == "independent_motion" and roi.mask_rle is not None:
+            moves = roi.label == "independent_motion"
+            boxes.append(ScoredBox(BoundingBox(box.x, box.y, box.width, box.height), roi.score, moves))
+            if moves and roi.mask_rle is not None:
                 motion |= decode_mask_rle(roi.mask_rle)
         thresholds = Thresholds(regions.threshold_mads, regions.min_residual_gray)
         finding = Finding(thresholds, tuple(boxes), motion)
@@ -150,7 +151,8 @@ def _finding(thresholds: Thresholds, found: Evidence, config: RegionConfig) -> F
         if region.label == "independent_motion":
             x, y, width, height = region.bbox
             motion[y : y + height, x : x + width] |= region.mask
-    return Finding(thresholds, tuple(ScoredBox(region.bbox, region.score) for region in regions), motion)
+    boxes = (ScoredBox(region.bbox, region.score, region.label == "independent_motion") for region in regions)
+    return Finding(thresholds, tuple(boxes), motion)
 
 
 def plain_residual(detector: AnomalyDetector) -> RivalMethod:

@@ -13,7 +13,6 @@ from viflow_anomaly.evaluation.detection_quality import ByMethod, DetectionMeasu
 from viflow_anomaly.evaluation.detection_scores import (
     IGNORED_SHARE,
     MIN_IOU,
-    MOTION_SCORE,
     SIZE_CLASSES,
     SPEED_CLASSES,
     DetectionScores,
@@ -82,7 +81,6 @@ def _rules() -> dict[str, Any]:
     return {
         "min_iou": MIN_IOU,
         "ignored_share": IGNORED_SHARE,
-        "motion_score": MOTION_SCORE,
         "min_area_px": MIN_AREA_PX,
         "min_independent_flow_px": MIN_INDEPENDENT_FLOW_PX,
         "size_classes_box_px": bounds(SIZE_CLASSES),

@@ -17,8 +17,6 @@ MIN_IOU = 0.3
 """A region finds a mover when their boxes overlap this much."""
 IGNORED_SHARE = 0.5
 """A region that lies this far in ignored boxes is neither right nor wrong."""
-MOTION_SCORE = 0.5
-"""Regions labelled ``independent_motion`` score at least this, others less; curves are over all of them."""
 FALSE_ALARM_RATES = (0.1, 0.01)
 """False alarms a frame at which recall is told."""
 
@@ -39,16 +37,18 @@ Curve = NDArray[np.float64]
 
 
 class ScoredBox(NamedTuple):
-    """A region as the ruler sees it."""
+    """A region as the ruler sees it; ``motion``: it is labelled ``independent_motion``. Curves are over all regions."""
 
     bbox: BoundingBox
     score: float
+    motion: bool
 
 
 class _Judged(NamedTuple):
     """A region that counts: what it found, or None for a false alarm."""
 
     score: float
+    motion: bool
     found: TrueObject | None
     box_area_px: int
 
@@ -90,9 +90,9 @@ class DetectionScores:
             area_px = box.bbox.width * box.bbox.height
             if best >= MIN_IOU:
                 free.discard(index)
-                self._judged.append(_Judged(box.score, counted[index], area_px))
+                self._judged.append(_Judged(box.score, box.motion, counted[index], area_px))
             elif not _is_ignored(box.bbox, ignored):
-                self._judged.append(_Judged(box.score, None, area_px))
+                self._judged.append(_Judged(box.score, box.motion, None, area_px))
 
     def merge(self, other: DetectionScores) -> None:
         """Count all of ``other``, too."""
@@ -128,14 +128,14 @@ class DetectionScores:
         return average_precision(curve.recall, curve.precision) if self.movers else None
 
     def alarms(self) -> int:
-        """False alarms as a user sees them: regions labelled as motion (their score is at least 0.5)."""
-        return sum(one.found is None and one.score >= MOTION_SCORE for one in self._judged)
+        """False alarms as a user sees them: regions  labelled as motion."""
+        return sum(one.found is None and one.motion for one in self._judged)
 
     def summary(self) -> dict[str, Any]:
         """All figures; None where there was nothing to find, or nothing found."""
         curve = self.curve()
         any_movers = bool(self.movers)
-        hits = sum(one.found is not None and one.score >= MOTION_SCORE for one in self._judged)
+        hits = sum(one.found is not None and one.motion for one in self._judged)
         alarms = self.alarms()
         return {
             "frames": self.frames,

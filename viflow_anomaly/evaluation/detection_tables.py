@@ -102,7 +102,7 @@ def notes(report: Report) -> list[str]:
         f"A region finds a mover when their boxes overlap by IoU {rules['min_iou']:g}. One half in an ignored "
         f"box counts neither way. Ignored: movers of less than {rules['min_area_px']} px or of less than "
         f"{rules['min_independent_flow_px']:g} px of motion, and boxes that are not said to move or to rest.",
-        f"recall, precision, alarms and IoU: of regions labelled as motion (score >= {rules['motion_score']:g}); "
+        "recall, precision, alarms and IoU: of regions labelled as motion; "
         "recall @0.1, @0.01: where the score's threshold leaves as many false alarms a frame; the curves (AP, best F1) "
         "are over all regions.",
         f"Size: px of the mover's box, {classes('size_classes_box_px')}. "
