@@ -190,7 +190,7 @@ class TestMeasures:
         assert region.mask.all()
         assert region.evidence["fill_ratio"] == 1
         assert region.evidence["aspect_ratio"] == 1
-        assert region.evidence["threshold_gray"] == pytest.approx(found(residual).threshold_gray)
+        assert region.evidence["threshold_gray"] == pytest.approx(found(residual).threshold)
 
     def test_thickness_tells_a_diagonal_band_from_a_square(self) -> None:
         diagonal = only(found(drawn(DIAGONAL_BAND)))
@@ -217,13 +217,13 @@ class TestThreshold:
         noise = np.abs(np.random.default_rng(1).normal(0, 10, (120, 160))).astype(np.float32)
         median = float(np.median(noise))
         mad = float(np.median(np.abs(noise - median)))
-        assert found(noise).threshold_gray == pytest.approx(median + 6 * 1.4826 * mad, rel=0.05)
+        assert found(noise).threshold == pytest.approx(median + 6 * 1.4826 * mad, rel=0.05)
 
     def test_it_never_falls_below_the_minimum(self) -> None:
         residual = np.zeros((64, 64), np.float32)
         residual[10:30, 10:30] = 5.9
         result = found(residual)
-        assert result.threshold_gray == 6.0
+        assert result.threshold == 6.0
         assert result.regions == ()
         assert only(found(residual, LITERAL.model_copy(update={"min_residual_gray": 5.0}))).area_px == 400
 
@@ -257,7 +257,7 @@ class TestThreshold:
         residual = np.full((48, 64), value, np.float32)
         result = found(residual, RegionConfig(), np.zeros(residual.shape, np.bool_))
         assert result.regions == ()
-        assert result.threshold_gray == RegionConfig().min_residual_gray
+        assert result.threshold == RegionConfig().min_residual_gray
         assert not result.mask.any()
 
     @pytest.mark.parametrize("value", [0.0, 5.0, 255.0])
@@ -382,7 +382,7 @@ def test_every_region_is_finite_and_inside_the_image(
 ) -> None:
     config = LITERAL.model_copy(update={"closing_fraction": closing, "smoothing_fraction": smoothing})
     result = found(residual, config, inside)
-    assert np.isfinite(result.threshold_gray)
+    assert np.isfinite(result.threshold)
     assert not (result.mask & ~inside).any()
     for region in result.regions:
         box = region.bbox

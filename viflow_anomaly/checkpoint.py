@@ -16,17 +16,23 @@ from torch import nn
 
 from viflow_anomaly.checkpoint_record import (
     CheckpointRecord,
+    EvidenceRecord,
+    TensorRecord,
     bundled_checkpoint,
+    bundled_evidence_head,
     corrupt_checkpoint,
     invalid_record,
     read_checkpoint,
     read_checkpoint_file,
+    read_tensors,
     write_atomically,
     write_record,
 )
 from viflow_anomaly.config import ModelConfig
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.model.builder import build_model
+from viflow_anomaly.model.evidence_builder import build_evidence_head
+from viflow_anomaly.model.evidence_head import EvidenceHead
 
 
 class LoadedCheckpoint(NamedTuple):
@@ -46,8 +52,7 @@ def save_checkpoint(
     provenance: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write ``path`` (.safetensors) and its JSON; the same weights and record give the same bytes."""
-    tensors = {key: value.detach().cpu().contiguous() for key, value in sorted(model.state_dict().items())}
-    data = save_tensors(tensors)
+    data = _tensor_bytes(model)
     record = CheckpointRecord(
         name=name,
         version=version,
@@ -55,10 +60,47 @@ def save_checkpoint(
         model=config,
         provenance=dict(provenance or {}),
     )
+    return _write_checkpoint(path, data, record)
+
+
+def save_evidence_head(path: Path, head: nn.Module, record: EvidenceRecord) -> Path:
+    """Write an evidence head: ``path`` (.safetensors) and its JSON; the record's checksum is filled in."""
+    data = _tensor_bytes(head)
+    sha256 = hashlib.sha256(data).hexdigest()
+    return _write_checkpoint(path, data, record.model_copy(update={"sha256": sha256, "onnx_sha256": None}))
+
+
+def _tensor_bytes(network: nn.Module) -> bytes:
+    tensors = {key: value.detach().cpu().contiguous() for key, value in sorted(network.state_dict().items())}
+    return save_tensors(tensors)
+
+
+def _write_checkpoint(path: Path, data: bytes, record: TensorRecord) -> Path:
     path.with_suffix(".onnx").unlink(missing_ok=True)  # an export of what was here before
     write_atomically(path, data)
     write_record(path, record)
     return path
+
+
+class LoadedEvidenceHead(NamedTuple):
+    """head: on the CPU, in evaluation mode."""
+
+    head: EvidenceHead
+    record: EvidenceRecord
+
+
+def load_evidence_head(path: Path | None = None) -> LoadedEvidenceHead:
+    """Read an evidence head (None: the bundled one); errors as ``load_checkpoint``."""
+    path = bundled_evidence_head() if path is None else path
+    data, record = read_tensors(path, EvidenceRecord)
+    head = build_evidence_head(record.head)
+    try:
+        head.load_state_dict(load_tensors(data))
+    except (SafetensorError, RuntimeError) as err:
+        raise corrupt_checkpoint(
+            path, f"expected the tensors of the head in its .json, found: {_one_line(err)}"
+        ) from err
+    return LoadedEvidenceHead(head.eval(), record)
 
 
 def load_checkpoint(path: Path | None = None) -> LoadedCheckpoint:

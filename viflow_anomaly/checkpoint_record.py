@@ -9,26 +9,26 @@ import os
 import subprocess
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, TypeVar
 
 from pydantic import Field, model_validator
 
-from viflow_anomaly.config import FrozenConfig, ModelConfig
+from viflow_anomaly.config import EvidenceHeadConfig, FrozenConfig, ModelConfig, RegionScore
 from viflow_anomaly.errors import CheckpointError, ConfigError
 
 FORMAT_VERSION = 1
 BUNDLED_NAME = "viflow-calibrated"
+BUNDLED_EVIDENCE_NAME = "viflow-evidence"
 MAX_RECORD_BYTES = 4 * 1024 * 1024
 
 
-class CheckpointRecord(FrozenConfig):
-    """The JSON beside the tensors.
+class TensorRecord(FrozenConfig):
+    """The JSON beside any tensors of ours.
 
     Attributes:
         format_version: of this layout; another one is refused.
-        name, version: of the model.
+        name, version: of the network.
         sha256: of the tensor file.
-        model: what the builder needs.
         onnx_sha256: of the export beside it, None until there is one.
         provenance: commit, training configuration, data, metrics; free-form, for people.
     """
@@ -37,9 +37,14 @@ class CheckpointRecord(FrozenConfig):
     name: str = Field(min_length=1)
     version: str = Field(min_length=1)
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
-    model: ModelConfig
     onnx_sha256: str | None = Field(default=None, pattern="^[0-9a-f]{64}$")
     provenance: dict[str, Any] = Field(default_factory=dict)
+
+
+class CheckpointRecord(TensorRecord):
+    """Of a VIFlow network; ``model`` is what the builder needs."""
+
+    model: ModelConfig
 
     @model_validator(mode="after")
     def _motor_stream_is_fitted(self) -> Self:
@@ -48,6 +53,29 @@ class CheckpointRecord(FrozenConfig):
                 f"model.motor: expected the values that a training fits for {self.model.motion_inputs!r}, found none"
             )
         return self
+
+
+class EvidenceRecord(TensorRecord):
+    """Of an evidence head.
+
+    Attributes:
+        head: what the builder needs.
+        photometric_cues, geometric_cues: their names, in the order that the head was trained on.
+        region_score: how what is found becomes a probability, fitted after the training.
+    """
+
+    head: EvidenceHeadConfig
+    photometric_cues: tuple[str, ...]
+    geometric_cues: tuple[str, ...]
+    region_score: RegionScore = RegionScore()
+
+
+Record = TypeVar("Record", bound=TensorRecord)
+
+
+def bundled_evidence_head() -> Path:
+    """The tensor file of the evidence head that ships with the package."""
+    return Path(str(resources.files("viflow_anomaly.weights"))) / f"{BUNDLED_EVIDENCE_NAME}.safetensors"
 
 
 def bundled_checkpoint() -> Path:
@@ -68,12 +96,17 @@ def write_atomically(path: Path, data: bytes) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def write_record(path: Path, record: CheckpointRecord) -> None:
+def write_record(path: Path, record: TensorRecord) -> None:
     """Write the JSON of the checkpoint ``path`` (its tensor file)."""
     write_atomically(path.with_suffix(".json"), (record.model_dump_json(indent=2) + "\n").encode())
 
 
 def read_checkpoint(path: Path) -> tuple[bytes, CheckpointRecord]:
+    """``read_tensors`` of a VIFlow network."""
+    return read_tensors(path, CheckpointRecord)
+
+
+def read_tensors(path: Path, kind: type[Record]) -> tuple[bytes, Record]:
     """The tensor file's bytes and its record; the checksum is compared, nothing is executed.
 
     Raises:
@@ -88,7 +121,7 @@ def read_checkpoint(path: Path) -> tuple[bytes, CheckpointRecord]:
             field="checkpoint",
         )
     data = read_checkpoint_file(path)
-    record = _read_record(path)
+    record = _read_record(path, kind)
     found = hashlib.sha256(data).hexdigest()
     if found != record.sha256:
         raise corrupt_checkpoint(path, f"expected sha256 {record.sha256}, found {found} over {len(data)} bytes")
@@ -107,7 +140,7 @@ def read_checkpoint_file(path: Path) -> bytes:
         ) from err
 
 
-def _read_record(path: Path) -> CheckpointRecord:
+def _read_record(path: Path, kind: type[Record]) -> Record:
     record_path = path.with_suffix(".json")
     if not record_path.exists():
         raise CheckpointError(
@@ -131,7 +164,7 @@ def _read_record(path: Path) -> CheckpointRecord:
             field="checkpoint",
         )
     try:
-        return CheckpointRecord.from_mapping(values, where=str(record_path))
+        return kind.from_mapping(values, where=str(record_path))
     except ConfigError as err:
         raise CheckpointError(err.message, code="checkpoint_record_invalid", field="checkpoint") from err
 

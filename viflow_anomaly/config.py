@@ -215,6 +215,9 @@ class RegionConfig(FrozenConfig):
     smoothing_fraction: float = Field(default=0.003, ge=0, le=0.02)
     threshold_mads: PositiveFloat = 6.0
     min_residual_gray: float = Field(default=6.0, ge=0, le=255, description="of the normalised residual")
+    min_motion_probability: float = Field(
+        default=0.5, ge=0.01, le=0.99, description="of a pixel, with learned evidence"
+    )
     opening_fraction: float = Field(default=0.004, ge=0, le=0.1)
     closing_fraction: float = Field(default=0.012, ge=0, le=0.1)
     min_area_fraction: float = Field(default=0.0006, ge=0, le=1, description="of the image's area")
@@ -272,6 +275,11 @@ class DetectorConfig(FrozenConfig):
     regions: RegionConfig = RegionConfig()
     correction: CorrectionConfig = CorrectionConfig()
     include_masks: bool = False
+    evidence: Literal["auto", "learned", "residual"] = Field(
+        default="auto",
+        description="what regions are found in: what the evidence head makes of the reconstruction, or the residual "
+        "alone (the paper's); auto: the head, where the network knows depth and the head was loaded",
+    )
     photometric_compensation: bool = Field(
         default=False, description="a gain and a bias between the images are fitted before the residual"
     )
@@ -281,6 +289,47 @@ class DetectorConfig(FrozenConfig):
     min_texture_gray: float = Field(default=2.0, ge=0, description="standard deviation below which nothing is judged")
     min_overlap: float = Field(default=0.05, ge=0, le=1, description="share of the analysed pixels still in the target")
     max_exposure_jump_gray: float = Field(default=40.0, ge=0, description="change of the mean between the frames")
+
+
+EVIDENCE_BLOCK_PX = 4
+"""Sides of the blocks of pixels that geometric cues are on, and at which the evidence head works."""
+
+
+class EvidenceHeadConfig(FrozenConfig):
+    """What the builder needs to make an evidence head; saved in its checkpoint."""
+
+    widths: tuple[PositiveInt, PositiveInt, PositiveInt, PositiveInt] = Field(
+        default=(32, 48, 64, 64), description="channels at strides 4, 8, 16 and 32"
+    )
+
+
+class RegionScore(FrozenConfig):
+    """Logistic regression from what is measured of a region to the probability that it moves by itself.
+
+    ``weights`` go with ``moving_regions.REGION_FEATURES``; empty: the mean probability of its pixels stands.
+    """
+
+    weights: tuple[float, ...] = ()
+    bias: float = 0.0
+
+
+class EvidenceTrainingConfig(FrozenConfig):
+    """One training of an evidence head; the seed fixes everything on a CPU."""
+
+    steps: PositiveInt = 12_000
+    batch_size: PositiveInt = 16
+    learning_rate: PositiveFloat = 2e-3
+    warmup_steps: int = Field(default=200, ge=0)
+    weight_decay: float = Field(default=1e-3, ge=0)
+    gradient_clip: PositiveFloat = 1.0
+    motion_weight: PositiveFloat = Field(default=3.0, description="of a moving pixel beside a resting one")
+    seam_weight: float = Field(default=0.3, ge=0, description="of the loss of seams between two movers")
+    crop_width: int = Field(default=224, ge=32, multiple_of=32)
+    crop_height: int = Field(default=128, ge=32, multiple_of=32)
+    every: PositiveInt = Field(default=1, description="take every n-th pair of a recording")
+    checkpoint_every: PositiveInt = 500
+    seed: int = Field(default=0, ge=0, le=2**63 - 1)
+    threads: int = Field(default=1, ge=1, le=MAX_THREADS)
 
 
 class TrackingConfig(FrozenConfig):

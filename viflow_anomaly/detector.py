@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -10,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from viflow_anomaly.checkpoint_record import CheckpointRecord
+from viflow_anomaly.checkpoint_record import CheckpointRecord, EvidenceRecord
 from viflow_anomaly.config import CorrectionConfig, DetectorConfig, MotorSource, RuntimeName
 from viflow_anomaly.correction import Correction
 from viflow_anomaly.detection import (
@@ -23,10 +24,19 @@ from viflow_anomaly.detection import (
     Roi,
     rois_from_regions,
 )
+from viflow_anomaly.errors import CheckpointError, ConfigError
+from viflow_anomaly.evidence_cues import (
+    GEOMETRIC_CUES,
+    PHOTOMETRIC_CUES,
+    EvidenceCues,
+    Reconstructed,
+    evidence_cues,
+)
 from viflow_anomaly.geometry import Float32Array, pixel_grid
 from viflow_anomaly.model_input import ModelInput, prepare
+from viflow_anomaly.moving_regions import MotionMaps, find_moving_regions
 from viflow_anomaly.prediction import PredictedFlow, predict_flow
-from viflow_anomaly.regions import find_regions
+from viflow_anomaly.regions import Region, find_regions
 from viflow_anomaly.residual import (
     compensate_exposure,
     half_range_gray,
@@ -35,7 +45,7 @@ from viflow_anomaly.residual import (
     texture_normalised,
 )
 from viflow_anomaly.runtime.interface import Runtime
-from viflow_anomaly.runtime.loading import load_runtime
+from viflow_anomaly.runtime.loading import LoadedEvidence, load_evidence, load_runtime
 from viflow_anomaly.sensor_data import FramePair
 
 RESIDUAL_SAMPLE_STRIDE = 3
@@ -58,7 +68,8 @@ class Analysis(NamedTuple):
     Attributes:
         detection: what ``detect`` returns.
         residual: [H, W] float32 photometric residual in gray levels at the source image's size.
-        evidence: [H, W] float32 what regions are found in: the residual, normalised by texture.
+        evidence: [H, W] float32 what regions are found in: probabilities of motion 0..1 (learned evidence), or the
+            residual, normalised by texture.
         inside: [H, W] analysed pixels that are still in the target image; elsewhere nothing is found.
         reconstruction: [H, W] float32 source image rebuilt from the target.
         target_coordinates: [H, W, 2] float32 where each source pixel is predicted in the target image.
@@ -79,6 +90,24 @@ class Analysis(NamedTuple):
         return self.target_coordinates - pixel_grid(*self.residual.shape)
 
 
+class _Explained(NamedTuple):
+    """A pair after prediction and reconstruction, before anything is judged."""
+
+    model_input: ModelInput
+    predicted: PredictedFlow
+    target_coordinates: Float32Array
+    inside: NDArray[np.bool_]
+    residual: Float32Array
+    rebuilt: Reconstructed
+
+
+class JudgedCues(NamedTuple):
+    """What the evidence head was shown, and what it says."""
+
+    cues: EvidenceCues
+    maps: MotionMaps
+
+
 class AnomalyDetector:
     """Finds independent motion. Holds weights and configuration only, so that threads may share it.
 
@@ -86,11 +115,29 @@ class AnomalyDetector:
         runtime: of the network.
         record: where the network came from and what its input looks like.
         config: thresholds and shape rule.
+        evidence: the evidence head, None: regions are found in the residual.
+
+    Raises:
+        ConfigError: ``evidence_head_missing`` where the configuration asks for one.
     """
 
-    def __init__(self, runtime: Runtime, record: CheckpointRecord, *, config: DetectorConfig) -> None:
+    def __init__(
+        self,
+        runtime: Runtime,
+        record: CheckpointRecord,
+        *,
+        config: DetectorConfig,
+        evidence: LoadedEvidence | None = None,
+    ) -> None:
+        if config.evidence == "learned" and evidence is None:
+            raise ConfigError(
+                "evidence: expected an evidence head for 'learned', found none loaded; 'residual' and 'auto' need none",
+                code="evidence_head_missing",
+                field="detector.evidence",
+            )
         self._runtime = runtime
         self._record = record
+        self._evidence = evidence
         self.config = config
         self.model_info = ModelInfo(name=record.name, version=record.version, sha256=record.sha256)
 
@@ -103,8 +150,9 @@ class AnomalyDetector:
         device: str = "cpu",
         runtime: RuntimeName = "auto",
         threads: int | None = None,
+        evidence_head: Path | None = None,
     ) -> Self:
-        """Load a checkpoint (None: the bundled model).
+        """Load a checkpoint (None: the bundled model) and an evidence head.
 
         Args:
             path: a ``.safetensors`` file with its ``.json`` beside it.
@@ -112,13 +160,16 @@ class AnomalyDetector:
             device: torch device name; another one than "cpu" needs the torch runtime.
             runtime: "auto" takes OpenVINO where it is installed and the checkpoint was exported, else torch.
             threads: CPU threads of the network (torch: of the whole process); None: torch's own, one in OpenVINO.
+            evidence_head: a ``.safetensors`` file likewise; None: the bundled one.
 
         Raises:
-            CheckpointError: as ``load_runtime``.
+            CheckpointError: as ``load_runtime``; ``evidence_cues_differ`` for a head of other cues than this version's.
             ConfigError: ``device_unavailable``, ``runtime_unavailable``.
         """
         loaded, record = load_runtime(path, runtime=runtime, device=device, threads=threads)
-        return cls(loaded, record, config=config or DetectorConfig())
+        evidence = load_evidence(evidence_head, runtime=runtime, device=device, threads=threads)
+        _require_our_cues(evidence.record)
+        return cls(loaded, record, config=config or DetectorConfig(), evidence=evidence)
 
     @property
     def runtime(self) -> str:
@@ -132,7 +183,7 @@ class AnomalyDetector:
 
     def with_config(self, config: DetectorConfig) -> AnomalyDetector:
         """The same weights under another configuration; nothing is loaded or copied."""
-        return AnomalyDetector(self._runtime, self._record, config=config)
+        return AnomalyDetector(self._runtime, self._record, config=config, evidence=self._evidence)
 
     def detect(self, pair: FramePair, *, decode_ms: float = 0.0) -> Detection:
         """Judge one pair.
@@ -146,16 +197,9 @@ class AnomalyDetector:
     def analyze(self, pair: FramePair, *, decode_ms: float = 0.0) -> Analysis:
         """``detect`` with its maps; same errors. The paper's algorithm on one screen."""
         started = time.perf_counter()
-        model_input = prepare(pair, self._record.model)
-        focal_px = self._record.model.view.focal_px
-        predicted = predict_flow(self._runtime, model_input, self.config.correction, focal_px=focal_px)
-        coordinates = model_input.view.target_coordinates(predicted.flow_px, predicted.stride)
-        reconstruction, inside = reconstruct(pair.target.image, coordinates)
-        if (analyzed := model_input.view.analyzed()) is not None:
-            inside &= analyzed
-        residual = self._residual(pair, model_input, predicted, reconstruction, inside)
-        half_range = half_range_gray(pair.source.image)
-        evidence = texture_normalised(residual, half_range, self.config.regions.texture_softening_gray)
+        explained = self._explain(pair)
+        model_input, predicted, coordinates, inside = explained[:4]
+        residual, judged = explained.residual, self._judged_cues(explained)
         inferred = time.perf_counter()
         x, y, region_width, region_height = model_input.view.region()
         summary = _summary(residual, inside, self.config.min_overlap, region_width * region_height)
@@ -168,7 +212,7 @@ class AnomalyDetector:
         rois: tuple[Roi, ...] = ()
         if not abstained:
             image = ImageSize(width=residual.shape[1], height=residual.shape[0])
-            regions = find_regions(evidence, inside, self.config.regions, residual=residual).regions
+            regions = self._regions(explained, judged)
             rois = rois_from_regions(
                 regions, image, include_masks=self.config.include_masks, target_coordinates=coordinates
             )
@@ -192,7 +236,63 @@ class AnomalyDetector:
             residual=summary,
             timings_ms=timings_ms,
         )
-        return Analysis(detection, residual, evidence, inside, reconstruction, coordinates, predicted)
+        evidence = explained.rebuilt.normalised if judged is None else judged.maps.motion
+        return Analysis(detection, residual, evidence, inside, explained.rebuilt.reconstruction, coordinates, predicted)
+
+    def judge_cues(self, pair: FramePair) -> tuple[JudgedCues, NDArray[np.bool_]] | None:
+        """What the head says of a pair, and which pixels [H, W] are inside; None where regions come from the residual.
+
+        Raises:
+            InvalidInputError: as ``detect``.
+        """
+        explained = self._explain(pair)
+        judged = self._judged_cues(explained)
+        return None if judged is None else (judged, explained.inside)
+
+    def cues(self, pair: FramePair) -> tuple[EvidenceCues, NDArray[np.bool_]]:
+        """What the evidence head is shown of a pair, and which pixels [H, W] are inside; errors as ``detect``."""
+        explained = self._explain(pair)
+        return self._cues(explained), explained.inside
+
+    def _judged_cues(self, explained: _Explained) -> JudgedCues | None:
+        """What the head makes of it; None: regions are found in the residual."""
+        correction = explained.predicted.correction
+        knows_depth = correction is not None and correction.motion is not None
+        if self._evidence is None or self.config.evidence == "residual":
+            return None
+        if self.config.evidence == "auto" and not knows_depth:
+            return None
+        cues = self._cues(explained)
+        height, width = explained.residual.shape
+        logits = self._evidence.runtime.judge(*cues)[:, :height, :width]
+        return JudgedCues(cues, MotionMaps(*(_sigmoid(one) for one in logits)))
+
+    def _regions(self, explained: _Explained, judged: JudgedCues | None) -> Sequence[Region]:
+        config, residual, inside = self.config.regions, explained.residual, explained.inside
+        if judged is None or self._evidence is None:
+            return find_regions(explained.rebuilt.normalised, inside, config, residual=residual).regions
+        score = self._evidence.record.region_score
+        return find_moving_regions(judged.maps, judged.cues, inside, config, residual=residual, score=score)
+
+    def _cues(self, explained: _Explained) -> EvidenceCues:
+        view, focal_px = explained.model_input.view, self._record.model.view.focal_px
+        return evidence_cues(explained.rebuilt, explained.predicted, view, focal_px=focal_px)
+
+    def _explain(self, pair: FramePair) -> _Explained:
+        """Predict the static world's flow, rebuild the source from the target by it, and compare the two."""
+        source = pair.source.image
+        model_input = prepare(pair, self._record.model)
+        focal_px = self._record.model.view.focal_px
+        predicted = predict_flow(self._runtime, model_input, self.config.correction, focal_px=focal_px)
+        coordinates = model_input.view.target_coordinates(predicted.flow_px, predicted.stride)
+        reconstruction, inside = reconstruct(pair.target.image, coordinates)
+        if (analyzed := model_input.view.analyzed()) is not None:
+            inside &= analyzed
+        residual = self._residual(pair, model_input, predicted, reconstruction, inside)
+        half_range = half_range_gray(source)
+        normalised = texture_normalised(residual, half_range, self.config.regions.texture_softening_gray)
+        rebuilt = Reconstructed(source, reconstruction, inside, normalised, half_range)
+        return _Explained(model_input, predicted, coordinates, inside, residual, rebuilt)
 
     def _residual(
         self,
@@ -246,6 +346,22 @@ class AnomalyDetector:
                 )
             )
         return tuple(reasons), abstained
+
+
+def _require_our_cues(record: EvidenceRecord) -> None:
+    expected, found = (PHOTOMETRIC_CUES, GEOMETRIC_CUES), (record.photometric_cues, record.geometric_cues)
+    if expected != found:
+        raise CheckpointError(
+            f"evidence head {record.name} {record.version}: expected one that was trained on the cues {expected}, "
+            f"found {found}",
+            code="evidence_cues_differ",
+            field="evidence_head",
+        )
+
+
+def _sigmoid(logits: Float32Array) -> Float32Array:
+    """exp(-87) is the last that float32 knows; beyond it the answer is the same."""
+    return np.asarray(1 / (1 + np.exp(-np.clip(logits, -80, 80))), dtype=np.float32)
 
 
 def _doubts(correction: Correction | None, config: CorrectionConfig) -> tuple[Reason, ...]:

@@ -3,9 +3,9 @@
 None of the cues is the picture itself. The head learns on simulated scenes; what it must not learn is what movers look
 like there. All cues are bounded to -1..1, so that nothing unheard of reaches the network from a real camera.
 
-Photometric cues are on every source pixel, geometric ones on blocks of ``BLOCK_PX`` pixels: flow is smooth, and the
-measured one is no finer. Of the flow that is left between source and reconstruction, only what lies *across* the
-epipolar line is independent motion for sure; *along* it, a wrong depth looks the same.
+Photometric cues are on every source pixel, geometric ones on blocks of 4x4: flow is smooth, and the measured one is no
+finer. Of the flow that is left between source and reconstruction, only what lies *across* the epipolar line is
+independent motion for sure; *along* it, a wrong depth looks the same.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from viflow_anomaly.config import EVIDENCE_BLOCK_PX
 from viflow_anomaly.correction import parallax_slope
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.measured_flow import measure_remaining_flow
@@ -23,7 +24,6 @@ from viflow_anomaly.prediction import PredictedFlow, view_rays
 from viflow_anomaly.sensor_data import Uint8Array
 from viflow_anomaly.view import InternalView
 
-BLOCK_PX = 4
 PHOTOMETRIC_CUES = ("difference", "normalised residual", "half range")
 GEOMETRIC_CUES = (
     "remaining flow across",
@@ -91,13 +91,14 @@ def evidence_cues(
     np.copyto(rebuilt, source, where=inside == 0)
     height, width = source.shape
     photometric = np.empty((len(PHOTOMETRIC_CUES), height, width), dtype=np.float32)
-    _bound(cv2.subtract(rebuilt, source, dtype=cv2.CV_32F), HALF_GRAY, photometric[0])
+    difference = np.asarray(cv2.subtract(rebuilt, source, dtype=cv2.CV_32F), dtype=np.float32)
+    _bound(difference, HALF_GRAY, photometric[0])
     _bound(_padded(reconstructed.normalised, outside=True), HALF_NORMALISED_GRAY, photometric[1])
     _bound(_padded(reconstructed.half_range), HALF_GRAY, photometric[2])
 
-    blocks = (width // BLOCK_PX, height // BLOCK_PX)
+    blocks = (width // EVIDENCE_BLOCK_PX, height // EVIDENCE_BLOCK_PX)
     geometric = np.empty((len(GEOMETRIC_CUES), *blocks[::-1]), dtype=np.float32)
-    remaining = measure_remaining_flow(source, rebuilt, block_px=BLOCK_PX)
+    remaining = measure_remaining_flow(source, rebuilt, block_px=EVIDENCE_BLOCK_PX)
     slope, log_ratio, log_depth = _parallax(predicted, view, blocks, focal_px)
     _split_along(remaining.flow_px, slope, geometric)
     _bound(remaining.mismatch_gray, HALF_MISMATCH_GRAY, geometric[3])
@@ -160,7 +161,7 @@ def _on_blocks(
     cells: Float32Array, predicted: PredictedFlow, view: InternalView, blocks: tuple[int, int]
 ) -> Float32Array:
     """[h, w, C] of the padded image; beyond the image its border is repeated."""
-    sampled = view.sample_blocks(cells, predicted.stride, BLOCK_PX)
+    sampled = view.sample_blocks(cells, predicted.stride, EVIDENCE_BLOCK_PX)
     below, right = blocks[1] - sampled.shape[0], blocks[0] - sampled.shape[1]
     if below or right:
         sampled = np.asarray(cv2.copyMakeBorder(sampled, 0, below, 0, right, cv2.BORDER_REPLICATE), np.float32)

@@ -52,12 +52,13 @@ class Region:
     """One connected component of high residual, all in pixels of the residual map.
 
     Attributes:
-        score: 0..1, confidence in independent motion; see ``_score``.
+        score: 0..1, confidence in independent motion.
         x_extent_px, y_extent_px: sides of the bounding box.
         area_px: pixels of the component.
         thickness_px: diameter of the largest disc inside it.
         residual_mean, residual_max: over its pixels, not smoothed, in gray levels.
-        evidence: ``rule`` that gave the label, ``contrast``, ``threshold_gray``, ``fill_ratio``, ``aspect_ratio``.
+        evidence: what decided, by name: always ``rule``, ``fill_ratio`` and ``aspect_ratio``; of the residual
+            ``contrast`` and ``threshold_gray``; of learned evidence see ``moving_regions``.
         mask: [bbox.height, bbox.width], True on the component.
     """
 
@@ -76,10 +77,11 @@ class Region:
 
 @dataclass(frozen=True, eq=False)
 class RegionResult:
-    """Regions, highest score first (ties by y then x), the threshold and the [H, W] mask that they came from."""
+    """Regions, highest score first (ties by y then x), the threshold on the evidence (in its unit) and the [H, W] mask
+    that they came from."""
 
     regions: tuple[Region, ...]
-    threshold_gray: float
+    threshold: float
     mask: BoolArray = field(repr=False)
 
 
@@ -90,11 +92,19 @@ class _Level(NamedTuple):
     threshold_gray: float
 
 
-class _Component(NamedTuple):
+class Component(NamedTuple):
     """Pixels of one component in row-major order: rows y [n] and columns x [n]."""
 
     y: IndexArray
     x: IndexArray
+
+    def outline(self) -> tuple[BoundingBox, BoolArray]:
+        """Bounding box, and the mask [height, width] in it."""
+        left, top = int(self.x.min()), int(self.y[0])
+        box = BoundingBox(left, top, int(self.x.max()) - left + 1, int(self.y[-1]) - top + 1)
+        mask = np.zeros((box.height, box.width), dtype=np.bool_)
+        mask[self.y - top, self.x - left] = True
+        return box, mask
 
 
 def find_regions(
@@ -114,12 +124,10 @@ def find_regions(
     level = _robust_level(smoothed, inside, config)
     closing_px = _odd_side_px(config.closing_fraction * diagonal_px)
     mask = _clean_mask(smoothed, inside, level, _odd_side_px(config.opening_fraction * diagonal_px), closing_px)
-    components = _largest_components(mask, closing_px, config)
-    limits = ShapeLimits(
-        min_x_px=config.min_x_extent_fraction * diagonal_px,
-        min_y_px=config.min_y_extent_fraction * diagonal_px,
-        max_aspect_ratio=config.max_aspect_ratio,
-    )
+    y, x = pixels_of(mask)
+    labels = _component_labels(y, x, mask.shape, pitch_px=(closing_px + 1) // 2)
+    components = largest_components(y, x, labels, mask.size, config)
+    limits = shape_limits(config, diagonal_px)
     regions = [
         _judge(component, evidence, evidence if residual is None else residual, level, config, limits)
         for component in components
@@ -163,24 +171,46 @@ def _clean_mask(
     return np.asarray((binary != 0) & inside)
 
 
-def _largest_components(mask: BoolArray, closing_px: int, config: RegionConfig) -> list[_Component]:
-    """8-connected components of at least the minimum area, at most ``max_regions`` (the largest), largest first.
+def shape_limits(config: RegionConfig, diagonal_px: float) -> ShapeLimits:
+    """The shape rule's limits in pixels of this image."""
+    return ShapeLimits(
+        min_x_px=config.min_x_extent_fraction * diagonal_px,
+        min_y_px=config.min_y_extent_fraction * diagonal_px,
+        max_aspect_ratio=config.max_aspect_ratio,
+    )
+
+
+def pixels_of(mask: BoolArray) -> tuple[IndexArray, IndexArray]:
+    """Rows y [n] and columns x [n] of a mask's pixels, row-major."""
+    y, x = np.divmod(np.flatnonzero(mask), mask.shape[1])  # np.nonzero takes five times as long
+    return y, x
+
+
+def largest_components(
+    y: IndexArray, x: IndexArray, labels: IndexArray, image_px: int, config: RegionConfig
+) -> list[Component]:
+    """Components of at least the minimum area, at most ``max_regions`` (the largest), largest first.
 
     Only the pixels of the mask are looked at, and no component before its area is known: a noisy mask of thousands of
     specks costs little more than a clean one.
+
+    Args:
+        y, x: of the mask's pixels, row-major.
+        labels: of each, from 1 on; 0 belongs to none.
+        image_px: pixels of the image.
+        config: limits.
     """
-    y, x = np.divmod(np.flatnonzero(mask), mask.shape[1])  # np.nonzero takes five times as long
-    labels = _component_labels(y, x, mask.shape, pitch_px=(closing_px + 1) // 2)
     areas_px = np.bincount(labels, minlength=1)
+    areas_px[0] = 0
     largest_first = np.argsort(-areas_px, kind="stable")[: config.max_regions]
-    kept = largest_first[areas_px[largest_first] >= max(1.0, config.min_area_fraction * mask.size)]
+    kept = largest_first[areas_px[largest_first] >= max(1.0, config.min_area_fraction * image_px)]
     rank_of_label = np.full(areas_px.size, kept.size)
     rank_of_label[kept] = np.arange(kept.size)
     rank = rank_of_label[labels].astype(np.uint16)  # 16 bits: numpy then sorts in linear time
     by_component = np.argsort(rank, kind="stable")
     ends = np.cumsum(areas_px[kept])[:-1]
     in_order = by_component[: int(areas_px[kept].sum())]
-    return [_Component(y[pixels], x[pixels]) for pixels in np.split(in_order, ends)] if kept.size else []
+    return [Component(y[pixels], x[pixels]) for pixels in np.split(in_order, ends)] if kept.size else []
 
 
 def _component_labels(y: IndexArray, x: IndexArray, shape: tuple[int, ...], pitch_px: int) -> IndexArray:
@@ -198,7 +228,7 @@ def _component_labels(y: IndexArray, x: IndexArray, shape: tuple[int, ...], pitc
 
 
 def _judge(
-    component: _Component,
+    component: Component,
     evidence: Float32Array,
     residual: Float32Array,
     level: _Level,
@@ -206,10 +236,7 @@ def _judge(
     limits: ShapeLimits,
 ) -> Region:
     y, x = component
-    left, top = int(x.min()), int(y[0])
-    box = BoundingBox(left, top, int(x.max()) - left + 1, int(y[-1]) - top + 1)
-    mask = np.zeros((box.height, box.width), dtype=np.bool_)
-    mask[y - top, x - left] = True
+    box, mask = component.outline()
     values = residual[y, x]
     evidence_gray = float(evidence[y, x].mean())
     fill_ratio = values.size / mask.size

@@ -78,21 +78,15 @@ class DetectionScores:
 
     def add_frame(self, boxes: Sequence[ScoredBox], labels: Labels, seconds: float) -> None:
         """Match one frame's regions with its movers."""
-        counted = [thing for thing in labels.objects if thing.counted]
-        ignored = [thing.bbox for thing in labels.objects if not thing.counted]
         self.frames += 1
         self.seconds += seconds
-        self.movers += counted
-        free = set(range(len(counted)))
-        for box in sorted(boxes, key=lambda one: -one.score):
-            overlaps = [(iou(box.bbox, counted[k].bbox), k) for k in sorted(free)]
-            best, index = max(overlaps, default=(0.0, -1))
-            area_px = box.bbox.width * box.bbox.height
-            if best >= MIN_IOU:
-                free.discard(index)
-                self._judged.append(_Judged(box.score, box.motion, counted[index], area_px))
-            elif not _is_ignored(box.bbox, ignored):
-                self._judged.append(_Judged(box.score, box.motion, None, area_px))
+        self.movers += [thing for thing in labels.objects if thing.counted]
+        self._judged += [one for one in _matched(boxes, labels) if one is not None]
+
+    @staticmethod
+    def hits(boxes: Sequence[ScoredBox], labels: Labels) -> list[bool | None]:
+        """Of each box, highest score first: whether it finds a mover; None where it counts neither way."""
+        return [None if one is None else one.found is not None for one in _matched(boxes, labels)]
 
     def merge(self, other: DetectionScores) -> None:
         """Count all of ``other``, too."""
@@ -167,6 +161,26 @@ class DetectionScores:
         if not self.movers:
             return None
         return float(curve.recall[curve.false_alarms <= per_frame * self.frames].max(initial=0.0))
+
+
+def _matched(boxes: Sequence[ScoredBox], labels: Labels) -> list[_Judged | None]:
+    """What each box found, highest score first; None: neither right nor wrong."""
+    counted = [thing for thing in labels.objects if thing.counted]
+    ignored = [thing.bbox for thing in labels.objects if not thing.counted]
+    free = set(range(len(counted)))
+    matched: list[_Judged | None] = []
+    for box in sorted(boxes, key=lambda one: -one.score):
+        overlaps = [(iou(box.bbox, counted[k].bbox), k) for k in sorted(free)]
+        best, index = max(overlaps, default=(0.0, -1))
+        area_px = box.bbox.width * box.bbox.height
+        if best >= MIN_IOU:
+            free.discard(index)
+            matched.append(_Judged(box.score, box.motion, counted[index], area_px))
+        elif _is_ignored(box.bbox, ignored):
+            matched.append(None)
+        else:
+            matched.append(_Judged(box.score, box.motion, None, area_px))
+    return matched
 
 
 def iou(first: BoundingBox, second: BoundingBox) -> float:

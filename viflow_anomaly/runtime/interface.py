@@ -51,3 +51,10 @@ class Runtime(Protocol):
 
     def predict(self, model_input: ModelInput) -> Hypotheses:
         """All hypotheses of one pair."""
+
+
+class EvidenceRuntime(Protocol):
+    """Runs one evidence head; threads may share it, too."""
+
+    def judge(self, photometric: Float32Array, geometric: Float32Array) -> Float32Array:
+        """Logits [2, H', W'] of motion and of seam, for cues [3, H', W'] and [10, H' / 4, W' / 4]."""

@@ -6,10 +6,17 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
-from viflow_anomaly.checkpoint_record import CheckpointRecord, bundled_checkpoint, read_checkpoint
+from viflow_anomaly.checkpoint_record import (
+    CheckpointRecord,
+    EvidenceRecord,
+    bundled_checkpoint,
+    bundled_evidence_head,
+    read_checkpoint,
+    read_tensors,
+)
 from viflow_anomaly.config import RuntimeName
 from viflow_anomaly.errors import ConfigError
-from viflow_anomaly.runtime.interface import Runtime
+from viflow_anomaly.runtime.interface import EvidenceRuntime, Runtime
 
 
 class LoadedRuntime(NamedTuple):
@@ -17,6 +24,13 @@ class LoadedRuntime(NamedTuple):
 
     runtime: Runtime
     record: CheckpointRecord
+
+
+class LoadedEvidence(NamedTuple):
+    """An evidence head ready to run, and where it came from."""
+
+    runtime: EvidenceRuntime
+    record: EvidenceRecord
 
 
 def load_runtime(
@@ -38,18 +52,34 @@ def load_runtime(
             exported to run, or was asked for with another device than the CPU.
     """
     path = bundled_checkpoint() if path is None else path
-    if path.suffix != ".safetensors":
-        read_checkpoint(path)  # says what is wrong with the name
-    exported = path.with_suffix(".onnx")
-    missing = _what_openvino_lacks(exported, device)
-    if runtime == "openvino" and missing:
-        raise ConfigError(f"runtime: {missing}", code="runtime_unavailable", field="runtime")
-    if runtime == "torch" or missing:
+    if not _takes_openvino(path, runtime, device):
         return _torch(path, device, threads)
     from viflow_anomaly.runtime.openvino_runtime import OpenvinoRuntime  # noqa: PLC0415  # an extra, half a second
 
     _, record = read_checkpoint(path)
-    return LoadedRuntime(OpenvinoRuntime(exported, record, threads=threads or 1), record)
+    return LoadedRuntime(OpenvinoRuntime(path.with_suffix(".onnx"), record, threads=threads or 1), record)
+
+
+def load_evidence(
+    path: Path | None, *, runtime: RuntimeName = "auto", device: str = "cpu", threads: int | None = None
+) -> LoadedEvidence:
+    """Load an evidence head (None: the bundled one); arguments and errors as ``load_runtime``."""
+    path = bundled_evidence_head() if path is None else path
+    if not _takes_openvino(path, runtime, device):
+        return _torch_evidence(path, device)
+    from viflow_anomaly.runtime.openvino_evidence import OpenvinoEvidence  # noqa: PLC0415
+
+    _, record = read_tensors(path, EvidenceRecord)
+    return LoadedEvidence(OpenvinoEvidence(path.with_suffix(".onnx"), record, threads=threads or 1), record)
+
+
+def _takes_openvino(path: Path, runtime: RuntimeName, device: str) -> bool:
+    if path.suffix != ".safetensors":
+        read_checkpoint(path)  # says what is wrong with the name
+    missing = _what_openvino_lacks(path.with_suffix(".onnx"), device)
+    if runtime == "openvino" and missing:
+        raise ConfigError(f"runtime: {missing}", code="runtime_unavailable", field="runtime")
+    return runtime != "torch" and not missing
 
 
 def _what_openvino_lacks(exported: Path, device: str) -> str | None:
@@ -74,3 +104,13 @@ def _torch(path: Path, device: str, threads: int | None) -> LoadedRuntime:
     require_device(device)
     network, record = load_checkpoint(path)
     return LoadedRuntime(TorchRuntime(network, device=device), record)
+
+
+def _torch_evidence(path: Path, device: str) -> LoadedEvidence:
+    from viflow_anomaly.batch import require_device  # noqa: PLC0415
+    from viflow_anomaly.checkpoint import load_evidence_head  # noqa: PLC0415
+    from viflow_anomaly.runtime.torch_evidence import TorchEvidence  # noqa: PLC0415
+
+    require_device(device)
+    head, record = load_evidence_head(path)
+    return LoadedEvidence(TorchEvidence(head, device=device), record)

@@ -1,0 +1,138 @@
+"""Supervised training of the evidence head: simulated masks of what moves are the teacher, geometric cues the pupil's
+only view. The network whose flow is judged stays as it is.
+
+As in ``training``, a step's data are a pure function of (seed, step), and the state on disk is exact.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F  # noqa: N812  # torch's own convention
+from torch import nn
+
+from viflow_anomaly.checkpoint import load_training_state, save_training_state
+from viflow_anomaly.config import EvidenceHeadConfig, EvidenceTrainingConfig
+from viflow_anomaly.errors import CheckpointError, ConfigError
+from viflow_anomaly.evidence_data import IGNORED, MOVING, SEAM, EvidenceBatch, EvidenceData
+from viflow_anomaly.model.evidence_builder import build_evidence_head
+from viflow_anomaly.model.evidence_head import EvidenceHead
+from viflow_anomaly.training_state import require_same_run, restore_state, state_tensors
+
+Fingerprint = dict[str, object]
+
+
+class EvidenceTraining:
+    """Head, optimiser and step counter of one run.
+
+    Args:
+        head: structure of the network.
+        config: of the training.
+        device: torch device name.
+    """
+
+    def __init__(self, head: EvidenceHeadConfig, config: EvidenceTrainingConfig, *, device: str = "cpu") -> None:
+        self.config = config
+        self.device = device
+        network = build_evidence_head(head, seed=config.seed).to(device)
+        self.network: EvidenceHead = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.optimizer = torch.optim.AdamW(
+            network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
+        )
+        self.step = 0
+
+    def run(self, data: EvidenceData, on_step: Callable[[int, float], None]) -> None:
+        """All steps that are left; ``on_step`` is called with the number of steps taken and the last one's loss.
+
+        Raises:
+            ConfigError: ``training_diverged``.
+        """
+        self.network.train()
+        while self.step < self.config.steps:
+            on_step(self.step, self.train_step(data.sample(self.step)))
+        self.network.eval()
+
+    def train_step(self, batch: EvidenceBatch) -> float:
+        """One optimiser step; its loss."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = _learning_rate(self.config, self.step)
+        cues = (torch.from_numpy(one).to(self.device) for one in (batch.photometric, batch.geometric))
+        logits = self.network(*(one.contiguous(memory_format=torch.channels_last) for one in cues))
+        truth = torch.from_numpy(batch.truth).to(self.device)
+        loss = evidence_loss(
+            logits, truth, motion_weight=self.config.motion_weight, seam_weight=self.config.seam_weight
+        )
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise ConfigError(
+                f"step {self.step}: expected a finite loss, found {value}: the training has diverged; a smaller "
+                "learning_rate helps",
+                code="training_diverged",
+                field="evidence_training.learning_rate",
+            )
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
+        self.optimizer.step()
+        self.step += 1
+        return value
+
+    def save(self, folder: Path, fingerprint: Fingerprint) -> None:
+        """Write the whole state atomically."""
+        tensors = state_tensors(self.network, self.optimizer)
+        save_training_state(folder, tensors, {"step": self.step, **fingerprint})
+
+    def restore(self, folder: Path, fingerprint: Fingerprint) -> bool:
+        """Take up the state in ``folder``; False where there is none.
+
+        Raises:
+            ConfigError: ``resume_config_differs``.
+            CheckpointError: ``checkpoint_corrupt``.
+        """
+        loaded = load_training_state(folder)
+        if loaded is None:
+            return False
+        tensors, record = loaded
+        require_same_run(folder, record, fingerprint)
+        restore_state(self.network, self.optimizer, tensors, folder)
+        step = record.get("step")
+        if not isinstance(step, int):
+            raise CheckpointError(
+                f"{folder}: expected the step that was reached, found {step!r}", code="checkpoint_corrupt", field="out"
+            )
+        self.step = step
+        return True
+
+
+def evidence_loss(
+    logits: torch.Tensor, truth: torch.Tensor, *, motion_weight: float, seam_weight: float
+) -> torch.Tensor:
+    """Binary cross-entropy of motion, half its Dice loss, and cross-entropy of seams among moving pixels.
+
+    Args:
+        logits: [B, 2, H, W] of motion and of seam.
+        truth: [B, H, W] uint8 bits (``evidence_data``); what is ignored does not count.
+        motion_weight: of a moving pixel's cross-entropy.
+        seam_weight: of the last term.
+    """
+    judged = ((truth & IGNORED) == 0).float()
+    moving, seam = ((truth & MOVING) != 0).float(), ((truth & SEAM) != 0).float()
+    weight = logits.new_tensor(motion_weight)
+    motion = F.binary_cross_entropy_with_logits(logits[:, 0], moving, reduction="none", pos_weight=weight)
+    cross_entropy = (motion * judged).sum() / judged.sum().clamp(min=1)
+    probability = torch.sigmoid(logits[:, 0]) * judged
+    shared, total = (probability * moving).sum(), probability.sum() + (judged * moving).sum()
+    dice = 1 - (2 * shared + 1) / (total + 1)
+    seams = F.binary_cross_entropy_with_logits(logits[:, 1], seam, reduction="none", pos_weight=weight)
+    return cross_entropy + 0.5 * dice + seam_weight * (seams * moving).sum() / moving.sum().clamp(min=1)
+
+
+def _learning_rate(config: EvidenceTrainingConfig, step: int) -> float:
+    """Linear warm-up, then half a cosine down to a hundredth."""
+    if step < config.warmup_steps:
+        return config.learning_rate * (step + 1) / config.warmup_steps
+    progress = (step - config.warmup_steps) / max(1, config.steps - config.warmup_steps)
+    return config.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(1.0, progress))))

@@ -1,0 +1,200 @@
+"""From the evidence head's maps to regions: pixels that probably move, cut along seams, scored as probabilities.
+
+Components, the paper's shape rule and the label are those of ``regions``. What differs: the map is a probability and
+needs no background to be compared with; two things that touch are cut apart where the head sees a seam; and the score
+is fitted (``RegionScore``), so that of regions scored 0.8 about 80 % move by themselves.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from skimage.measure import label as label_components
+
+from viflow_anomaly.config import EVIDENCE_BLOCK_PX, RegionConfig, RegionScore
+from viflow_anomaly.evidence_cues import GEOMETRIC_CUES, HALF_PARALLAX_PX, HALF_REMAINING_PX, EvidenceCues
+from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.regions import (
+    BoolArray,
+    BoundingBox,
+    Component,
+    IndexArray,
+    Region,
+    largest_components,
+    pixels_of,
+    shape_limits,
+)
+from viflow_anomaly.sensor_data import Float64Array
+from viflow_anomaly.shape_rule import Shape, judge_shape, thickness_px
+
+SEAM_PROBABILITY = 0.5
+SEAM_REACH_PX = 5
+"""Pixels of a seam go to the component that is nearest, within so many pixels."""
+MAX_LOGIT = 8.0
+BAND_SCORE = 0.49
+"""The most that a region scores which the shape rule calls a band."""
+REGION_FEATURES = (
+    "logit of the mean probability",
+    "logit of the largest probability",
+    "logarithm of the area's share",
+    "fill ratio",
+    "nearness to a band",
+    "seam",
+    "remaining flow across",
+    "remaining flow along",
+    "mismatch after it",
+    "texture",
+    "parallax",
+    "inside",
+)
+"""What a score is fitted to; the cues are means over the region, bounded as in ``evidence_cues``."""
+CUE_FEATURES = REGION_FEATURES[6:]
+_CUES = [GEOMETRIC_CUES.index(name) for name in CUE_FEATURES]
+
+
+class MotionMaps(NamedTuple):
+    """What the head says of every source pixel: probabilities [H, W] of motion and, where it moves, of a seam."""
+
+    motion: Float32Array
+    seam: Float32Array
+
+
+class MeasuredRegion(NamedTuple):
+    """A component before it has a score: ``features`` [12] are ``REGION_FEATURES``, ``outline`` is its box's mask."""
+
+    component: Component
+    box: BoundingBox
+    outline: BoolArray
+    thickness_px: float
+    shape: Shape
+    features: Float64Array
+
+
+def measure_regions(
+    maps: MotionMaps, cues: EvidenceCues, inside: BoolArray, config: RegionConfig
+) -> list[MeasuredRegion]:
+    """Connected regions that probably move, largest first; arguments as in ``find_moving_regions``."""
+    mask = (maps.motion > config.min_motion_probability) & inside
+    y, x = pixels_of(mask)
+    components = largest_components(y, x, _labels(mask, maps.seam)[y, x], mask.size, config)
+    limits = shape_limits(config, float(np.hypot(*mask.shape)))
+    measured = []
+    for component in components:
+        box, outline = component.outline()
+        thickness = thickness_px(outline)
+        shape = judge_shape(config.shape_rule, outline, thickness, limits)
+        features = _features(component, maps, cues, outline, shape)
+        measured.append(MeasuredRegion(component, box, outline, thickness, shape, features))
+    return measured
+
+
+def find_moving_regions(
+    maps: MotionMaps,
+    cues: EvidenceCues,
+    inside: BoolArray,
+    config: RegionConfig,
+    *,
+    residual: Float32Array,
+    score: RegionScore,
+) -> list[Region]:
+    """Connected regions that probably move, each labelled by the paper's shape rule and its own probability.
+
+    Args:
+        maps: of the head.
+        cues: that the head saw.
+        inside: [H, W], False where the target image does not reach; nothing is found there.
+        config: thresholds, see ``RegionConfig``.
+        residual: [H, W] float32 what a region's ``residual_mean`` and ``residual_max`` are of.
+        score: as fitted for this head.
+
+    Returns:
+        Highest score first, ties by y then x.
+    """
+    regions = [_judge(one, residual, score, config) for one in measure_regions(maps, cues, inside, config)]
+    return sorted(regions, key=lambda region: (-region.score, region.bbox.y, region.bbox.x))
+
+
+def _judge(measured: MeasuredRegion, residual: Float32Array, score: RegionScore, config: RegionConfig) -> Region:
+    component, box, outline, thickness, shape, features = measured
+    probability = probability_of(features, score)
+    if not shape.passes:
+        probability = min(probability, BAND_SCORE)
+    moves = shape.passes and probability >= config.motion_score
+    values = residual[component.y, component.x]
+    return Region(
+        label="independent_motion" if moves else "model_error",
+        score=probability,
+        bbox=box,
+        x_extent_px=box.width,
+        y_extent_px=box.height,
+        area_px=int(values.size),
+        thickness_px=thickness,
+        residual_mean=float(values.mean()),
+        residual_max=float(values.max()),
+        evidence=_evidence(features, shape, box.width / box.height, config),
+        mask=outline,
+    )
+
+
+def _labels(mask: BoolArray, seam: Float32Array) -> IndexArray:
+    """[H, W] components (1..) of the mask, cut along seams; what is left of a seam joins no component."""
+    cut = mask & (seam > SEAM_PROBABILITY)
+    labels = np.asarray(label_components(mask & ~cut, connectivity=2))  # type: ignore[no-untyped-call]
+    if not cut.any() or labels.max() > np.iinfo(np.uint16).max:
+        return labels.astype(np.intp)
+    grown = labels.astype(np.uint16)
+    block = np.ones((3, 3), np.uint8)
+    for _ in range(SEAM_REACH_PX):
+        np.copyto(grown, np.asarray(cv2.dilate(grown, block), np.uint16), where=cut & (grown == 0))
+    return grown.astype(np.intp)
+
+
+def _features(
+    component: Component, maps: MotionMaps, cues: EvidenceCues, outline: BoolArray, shape: Shape
+) -> Float64Array:
+    """[12], in the order of ``REGION_FEATURES``."""
+    y, x = component
+    motion = maps.motion[y, x]
+    blocks = (y // EVIDENCE_BLOCK_PX, x // EVIDENCE_BLOCK_PX)
+    means = [np.abs(cues.geometric[cue][blocks]).mean() for cue in _CUES]
+    shares = (np.log(motion.size / maps.motion.size), motion.size / outline.size, min(shape.nearness_to_band, 2.0))
+    own = (_logit(motion.mean()), _logit(motion.max()), *shares, maps.seam[y, x].mean())
+    return np.array([*own, *means], dtype=np.float64)
+
+
+def _logit(probability: float) -> float:
+    return float(np.clip(np.log(probability / max(1 - probability, 1e-9)), -MAX_LOGIT, MAX_LOGIT))
+
+
+def probability_of(features: Float64Array, score: RegionScore) -> float:
+    """That a region moves by itself, 0..1, rounded so that equal scores tie in the written answer as well."""
+    logit = float(features @ np.array(score.weights)) + score.bias if score.weights else float(features[0])
+    return round(1 / (1 + float(np.exp(-np.clip(logit, -MAX_LOGIT, MAX_LOGIT)))), 4)
+
+
+def _evidence(features: Float64Array, shape: Shape, ratio: float, config: RegionConfig) -> dict[str, float | str]:
+    """What decided, in units that a person can judge; the cues' bound is undone."""
+    across, along, parallax = (
+        _unbounded(features[REGION_FEATURES.index(name)], half)
+        for name, half in (
+            ("remaining flow across", HALF_REMAINING_PX),
+            ("remaining flow along", HALF_REMAINING_PX),
+            ("parallax", HALF_PARALLAX_PX),
+        )
+    )
+    return {
+        "rule": shape.verdict,
+        "probability": 1 / (1 + float(np.exp(-features[0]))),
+        "min_probability": config.min_motion_probability,
+        "fill_ratio": float(features[3]),
+        "aspect_ratio": max(ratio, 1 / ratio),
+        "across_epipolar_px": across,
+        "along_epipolar_px": along,
+        "parallax_px": parallax,
+    }
+
+
+def _unbounded(bounded: float, half: float) -> float:
+    return float(half * bounded / max(1 - bounded, 1e-3))

@@ -1,0 +1,34 @@
+"""OpenVINO on a CPU: the exported evidence head."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from viflow_anomaly.checkpoint_record import EvidenceRecord
+from viflow_anomaly.config import EVIDENCE_BLOCK_PX
+from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.runtime.openvino_network import OpenvinoNetwork, Size
+
+
+class OpenvinoEvidence:
+    """Runs the head's ``NAME.onnx``; arguments and errors as ``OpenvinoNetwork``."""
+
+    def __init__(self, path: Path, record: EvidenceRecord, *, threads: int = 1) -> None:
+        counts = (len(record.photometric_cues), len(record.geometric_cues))
+
+        def shapes(size: Size) -> dict[str, list[int]]:
+            blocks = [side // EVIDENCE_BLOCK_PX for side in size]
+            return {"photometric": [1, counts[0], *size], "geometric": [1, counts[1], *blocks]}
+
+        self._network = OpenvinoNetwork(path, record, shapes=shapes, threads=threads)
+
+    def judge(self, photometric: Float32Array, geometric: Float32Array) -> Float32Array:
+        """Logits [2, H', W'] of motion and of seam."""
+        height, width = photometric.shape[1:]
+        request, inputs, outputs = self._network.request((height, width))
+        np.copyto(inputs["photometric"][0], photometric)
+        np.copyto(inputs["geometric"][0], geometric)
+        request.infer()
+        return np.asarray(outputs["logits"][0].copy(), dtype=np.float32)

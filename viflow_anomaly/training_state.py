@@ -1,0 +1,85 @@
+"""The exact way of a network and its optimiser to disk and back."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from viflow_anomaly.errors import CheckpointError, ConfigError
+
+
+def state_tensors(network: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, torch.Tensor]:
+    """All tensors of a running training by name."""
+    tensors = {f"model.{key}": value for key, value in network.state_dict().items()}
+    for index, state in optimizer.state_dict()["state"].items():
+        tensors |= {f"optimizer.{index}.{key}": torch.as_tensor(value) for key, value in state.items()}
+    return tensors
+
+
+def restore_state(
+    network: nn.Module, optimizer: torch.optim.Optimizer, tensors: Mapping[str, torch.Tensor], folder: Path
+) -> None:
+    """Take up what ``state_tensors`` gave.
+
+    Raises:
+        CheckpointError: ``checkpoint_corrupt``, with ``folder`` in its text.
+    """
+    try:
+        network.load_state_dict(_below(tensors, "model."))
+        _restore_optimizer(network, optimizer, _below(tensors, "optimizer."))
+    except (RuntimeError, ValueError, LookupError) as err:
+        raise CheckpointError(
+            f"{folder}: expected the whole state of this training, found: {' '.join(str(err).split())[:300]}",
+            code="checkpoint_corrupt",
+            field="out",
+        ) from err
+
+
+def _restore_optimizer(
+    network: nn.Module, optimizer: torch.optim.Optimizer, tensors: Mapping[str, torch.Tensor]
+) -> None:
+    parameters = list(network.parameters())
+    states: dict[int, dict[str, torch.Tensor]] = {}
+    for key, value in tensors.items():
+        index, name = key.split(".", 1)
+        # A moment of another memory layout than its parameter's would take another arithmetic path.
+        like = parameters[int(index)]
+        same_layout = torch.empty_like(like).copy_(value) if value.shape == like.shape else value
+        states.setdefault(int(index), {})[name] = same_layout
+    optimizer.load_state_dict({**optimizer.state_dict(), "state": states})
+
+
+def _below(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+
+
+def require_same_run(folder: Path, record: Mapping[str, Any], fingerprint: Mapping[str, Any]) -> None:
+    """A resumed training must be the one that was started.
+
+    Raises:
+        ConfigError: ``resume_config_differs``.
+    """
+    for key, value in fingerprint.items():
+        before, now = record.get(key), json.loads(json.dumps(value))
+        if before != now:
+            raise ConfigError(
+                f"{folder}: --resume expects the {key} that the run was started with, {_difference(before, now)}",
+                code="resume_config_differs",
+                field=key,
+            )
+
+
+def _difference(before: object, now: object) -> str:
+    """What the error shows: both values; of lists of names, which may be hundreds long, only what one of them lacks."""
+    if not isinstance(now, list):
+        return f"{before}, found {now}"
+    if not isinstance(before, list):
+        return f"which its state does not name, found {len(now)}"
+    lost, added = ((Counter(one) - Counter(other)).elements() for one, other in ((before, now), (now, before)))
+    return f"{len(before)}, found {len(now)}: without {sorted(lost)[:5]}, with {sorted(added)[:5]}"
