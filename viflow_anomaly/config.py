@@ -316,6 +316,7 @@ class RegionScore(FrozenConfig):
 class EvidenceTrainingConfig(FrozenConfig):
     """One training of an evidence head; the seed fixes everything on a CPU."""
 
+    head: EvidenceHeadConfig = EvidenceHeadConfig()
     steps: PositiveInt = 12_000
     batch_size: PositiveInt = 16
     learning_rate: PositiveFloat = 2e-3

@@ -151,6 +151,7 @@ class AnomalyDetector:
         runtime: RuntimeName = "auto",
         threads: int | None = None,
         evidence_head: Path | None = None,
+        with_evidence: bool = True,
     ) -> Self:
         """Load a checkpoint (None: the bundled model) and an evidence head.
 
@@ -161,14 +162,17 @@ class AnomalyDetector:
             runtime: "auto" takes OpenVINO where it is installed and the checkpoint was exported, else torch.
             threads: CPU threads of the network (torch: of the whole process); None: torch's own, one in OpenVINO.
             evidence_head: a ``.safetensors`` file likewise; None: the bundled one.
+            with_evidence: False: none is loaded, and regions are found in the residual.
 
         Raises:
             CheckpointError: as ``load_runtime``; ``evidence_cues_differ`` for a head of other cues than this version's.
             ConfigError: ``device_unavailable``, ``runtime_unavailable``.
         """
         loaded, record = load_runtime(path, runtime=runtime, device=device, threads=threads)
-        evidence = load_evidence(evidence_head, runtime=runtime, device=device, threads=threads)
-        _require_our_cues(evidence.record)
+        evidence = None
+        if with_evidence:
+            evidence = load_evidence(evidence_head, runtime=runtime, device=device, threads=threads)
+            _require_our_cues(evidence.record)
         return cls(loaded, record, config=config or DetectorConfig(), evidence=evidence)
 
     @property
@@ -184,6 +188,15 @@ class AnomalyDetector:
     def with_config(self, config: DetectorConfig) -> AnomalyDetector:
         """The same weights under another configuration; nothing is loaded or copied."""
         return AnomalyDetector(self._runtime, self._record, config=config, evidence=self._evidence)
+
+    def with_evidence(self, evidence: LoadedEvidence) -> AnomalyDetector:
+        """The same network and configuration with another evidence head.
+
+        Raises:
+            CheckpointError: ``evidence_cues_differ``.
+        """
+        _require_our_cues(evidence.record)
+        return AnomalyDetector(self._runtime, self._record, config=self.config, evidence=evidence)
 
     def detect(self, pair: FramePair, *, decode_ms: float = 0.0) -> Detection:
         """Judge one pair.

@@ -15,7 +15,7 @@ import torch.nn.functional as F  # noqa: N812  # torch's own convention
 from torch import nn
 
 from viflow_anomaly.checkpoint import load_training_state, save_training_state
-from viflow_anomaly.config import EvidenceHeadConfig, EvidenceTrainingConfig
+from viflow_anomaly.config import EvidenceTrainingConfig
 from viflow_anomaly.errors import CheckpointError, ConfigError
 from viflow_anomaly.evidence_data import IGNORED, MOVING, SEAM, EvidenceBatch, EvidenceData
 from viflow_anomaly.model.evidence_builder import build_evidence_head
@@ -26,18 +26,12 @@ Fingerprint = dict[str, object]
 
 
 class EvidenceTraining:
-    """Head, optimiser and step counter of one run.
+    """Head, optimiser and step counter of one run on a torch device."""
 
-    Args:
-        head: structure of the network.
-        config: of the training.
-        device: torch device name.
-    """
-
-    def __init__(self, head: EvidenceHeadConfig, config: EvidenceTrainingConfig, *, device: str = "cpu") -> None:
+    def __init__(self, config: EvidenceTrainingConfig, *, device: str = "cpu") -> None:
         self.config = config
         self.device = device
-        network = build_evidence_head(head, seed=config.seed).to(device)
+        network = build_evidence_head(config.head, seed=config.seed).to(device)
         self.network: EvidenceHead = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.optimizer = torch.optim.AdamW(
             network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay

@@ -21,6 +21,7 @@ from pydantic import BaseModel, Field
 from viflow_anomaly.config import (
     MAX_THREADS,
     DetectorConfig,
+    EvidenceTrainingConfig,
     FrozenConfig,
     ImageLimits,
     ModelConfig,
@@ -63,6 +64,7 @@ class Settings(FrozenConfig):
     """
 
     checkpoint: UsablePath | None = None
+    evidence_head: UsablePath | None = None
     device: str = "cpu"
     threads: int = Field(default=1, ge=1, le=MAX_THREADS)
     runtime: RuntimeName = "auto"
@@ -71,6 +73,7 @@ class Settings(FrozenConfig):
     tracking: TrackingConfig = TrackingConfig()
     model: ModelConfig = ModelConfig()
     training: TrainingConfig = TrainingConfig()
+    evidence_training: EvidenceTrainingConfig = EvidenceTrainingConfig()
     simulator: SimulatorConfig = Field(default_factory=lambda: SimulatorConfig.model_validate({}))
 
 

@@ -12,6 +12,9 @@ from viflow_anomaly.cli.options import Assignments, Checkpoint, ConfigFile, sett
 
 def export(
     checkpoint: Checkpoint = None,
+    evidence_head: Annotated[
+        Path | None, typer.Option(metavar="PATH", help="Export this evidence head instead.", show_default=False)
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Where to (default: NAME.onnx beside the checkpoint).")
     ] = None,
@@ -28,9 +31,9 @@ def export(
       viflow-anomaly export --checkpoint runs/first/model.safetensors
     """
     settings = settings_from(config, assignments, {"checkpoint": checkpoint})
-    from viflow_anomaly.runtime.export import export_onnx
+    from viflow_anomaly.runtime.export import export_evidence_onnx, export_onnx
 
-    print(export_onnx(settings.checkpoint, out))
+    print(export_onnx(settings.checkpoint, out) if evidence_head is None else export_evidence_onnx(evidence_head, out))
 
 
 def register(app: typer.Typer) -> None:

@@ -25,6 +25,7 @@ from viflow_anomaly.cli import (
     serve,
     simulate,
     train,
+    train_evidence,
 )
 from viflow_anomaly.errors import ViflowError
 
@@ -39,7 +40,19 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="Exit codes: 0 done, 2 bad usage or input, 3 some pairs failed, 130 interrupted.",
 )
-for module in (detect, batch, simulate, train, groundtruth, evaluate, export, serve, schema, configuration):
+for module in (
+    detect,
+    batch,
+    simulate,
+    train,
+    train_evidence,
+    groundtruth,
+    evaluate,
+    export,
+    serve,
+    schema,
+    configuration,
+):
     module.register(app)
 
 

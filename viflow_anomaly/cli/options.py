@@ -46,8 +46,8 @@ def settings_from(
     return resolve_settings(config_file=config, environment=os.environ, assignments=assignments or (), options=options)
 
 
-def load_detector(settings: Settings) -> AnomalyDetector:
-    """The detector that the settings describe, with its threads limited.
+def load_detector(settings: Settings, *, evidence: bool = True) -> AnomalyDetector:
+    """The detector that the settings describe, with its threads limited; without ``evidence`` no head is loaded.
 
     Raises:
         CheckpointError: a checkpoint that cannot be used.
@@ -63,4 +63,6 @@ def load_detector(settings: Settings) -> AnomalyDetector:
         device=settings.device,
         runtime=settings.runtime,
         threads=settings.threads,
+        evidence_head=settings.evidence_head,
+        with_evidence=evidence,
     )

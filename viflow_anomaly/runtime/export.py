@@ -8,16 +8,23 @@ import io
 import logging
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import nn
 
-from viflow_anomaly.checkpoint import load_checkpoint
-from viflow_anomaly.checkpoint_record import bundled_checkpoint, write_atomically, write_record
-from viflow_anomaly.config import ModelConfig
+from viflow_anomaly.checkpoint import load_checkpoint, load_evidence_head
+from viflow_anomaly.checkpoint_record import (
+    EvidenceRecord,
+    TensorRecord,
+    bundled_checkpoint,
+    bundled_evidence_head,
+    write_atomically,
+    write_record,
+)
+from viflow_anomaly.config import EVIDENCE_BLOCK_PX, ModelConfig
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.model.layers import COARSEST_STRIDE
 from viflow_anomaly.model.outputs import ViflowOutput
@@ -52,6 +59,28 @@ def export_onnx(path: Path | None, out: Path | None = None) -> Path:
         ConfigError: ``export_unavailable``: the packages onnx and onnxscript are missing; ``export_name``: ``out`` is
             no .onnx file.
     """
+    path = bundled_checkpoint() if path is None else path
+    network, record = load_checkpoint(path)
+    inputs = _example(record.model)
+    metadata = {
+        exported.MODEL_KEY: record.model.model_dump_json(),
+        exported.FLOW_STRIDE_KEY: str(network(*inputs).stride),
+    }
+    return _write(path, out, record, metadata, lambda: _traced(network, inputs, fixed=record.model.preset == "paper"))
+
+
+def export_evidence_onnx(path: Path | None, out: Path | None = None) -> Path:
+    """``export_onnx`` of an evidence head (None: the bundled one), for any image size."""
+    path = bundled_evidence_head() if path is None else path
+    head, record = load_evidence_head(path)
+    return _write(
+        path, out, record, {exported.HEAD_KEY: record.head.model_dump_json()}, lambda: _traced_head(head, record)
+    )
+
+
+def _write(
+    path: Path, out: Path | None, record: TensorRecord, metadata: Mapping[str, str], traced: Callable[[], Any]
+) -> Path:
     try:
         import onnx  # noqa: PLC0415  # an extra
         import onnxscript  # noqa: F401, PLC0415
@@ -61,34 +90,22 @@ def export_onnx(path: Path | None, out: Path | None = None) -> Path:
             "pip install 'viflow-anomaly[export]'",
             code="export_unavailable",
         ) from err
-    path = bundled_checkpoint() if path is None else path
-    network, record = load_checkpoint(path)
     out = path.with_suffix(".onnx") if out is None else out
     if out.suffix != ".onnx":
         raise ConfigError(
             f"export: expected the name of an .onnx file to write, found {str(out)!r}", code="export_name", field="out"
         )
-    inputs = _example(record.model)
-    stride = network(*inputs).stride
-    program = _traced(network, inputs, fixed=record.model.preset == "paper")
     with tempfile.TemporaryDirectory() as folder:
         whole = Path(folder) / "network.onnx"
-        program.save(str(whole))
+        traced().save(str(whole))
         model = onnx.load(str(whole))
-    metadata = {
-        exported.NAME_KEY: record.name,
-        exported.VERSION_KEY: record.version,
-        exported.WEIGHTS_KEY: record.sha256,
-        exported.MODEL_KEY: record.model.model_dump_json(),
-        exported.FLOW_STRIDE_KEY: str(stride),
-    }
+    named = {exported.NAME_KEY: record.name, exported.VERSION_KEY: record.version, exported.WEIGHTS_KEY: record.sha256}
     _forget_the_machine(model)
-    onnx.helper.set_model_props(model, metadata)
+    onnx.helper.set_model_props(model, {**named, **metadata})
     data = model.SerializeToString(deterministic=True)
     write_atomically(out, data)
     if out == path.with_suffix(".onnx"):
-        named = record.model_copy(update={"onnx_sha256": hashlib.sha256(data).hexdigest()})
-        write_record(path, named)
+        write_record(path, record.model_copy(update={"onnx_sha256": hashlib.sha256(data).hexdigest()}))
     return out
 
 
@@ -137,6 +154,30 @@ def _traced(network: nn.Module, inputs: tuple[torch.Tensor, ...], *, fixed: bool
             opset_version=OPSET,
             input_names=list(exported.INPUT_NAMES[: len(inputs)]),
             output_names=list(exported.SCENE_OUTPUTS if scene else exported.FLOW_OUTPUTS),
+            dynamic_shapes=shapes,
+            verbose=False,
+            external_data=False,
+        )
+
+
+def _traced_head(head: nn.Module, record: EvidenceRecord) -> Any:
+    side = COARSEST_STRIDE * 4
+    photometric = torch.zeros(1, len(record.photometric_cues), side, 2 * side)
+    geometric = torch.zeros(1, len(record.geometric_cues), side // EVIDENCE_BLOCK_PX, 2 * side // EVIDENCE_BLOCK_PX)
+    rows, columns = torch.export.Dim("rows", min=1, max=1024), torch.export.Dim("columns", min=1, max=1024)
+    step = COARSEST_STRIDE // EVIDENCE_BLOCK_PX
+    shapes = (
+        {2: COARSEST_STRIDE * rows, 3: COARSEST_STRIDE * columns},
+        {2: step * rows, 3: step * columns},
+    )
+    with _quiet(), torch.no_grad():
+        return torch.onnx.export(
+            head.eval(),
+            (photometric, geometric),
+            dynamo=True,
+            opset_version=OPSET,
+            input_names=list(exported.HEAD_INPUTS),
+            output_names=list(exported.HEAD_OUTPUTS),
             dynamic_shapes=shapes,
             verbose=False,
             external_data=False,

@@ -9,9 +9,11 @@ VERSION_KEY = "viflow.version"
 WEIGHTS_KEY = "viflow.weights_sha256"
 MODEL_KEY = "viflow.model"
 FLOW_STRIDE_KEY = "viflow.flow_stride"
+HEAD_KEY = "viflow.evidence_head"
 INPUT_NAMES = ("source", "motion", "interval_s", "motor")
 """The last one where the network has a motor stream."""
 FLOW_OUTPUTS = ("flow_px",)
+HEAD_INPUTS, HEAD_OUTPUTS = ("photometric", "geometric"), ("logits",)
 SCENE_OUTPUTS = ("flow_px", "inverse_depth", "rotation", "translation")
 
 

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from viflow_anomaly.checkpoint_record import EvidenceRecord
+from viflow_anomaly.checkpoint_record import EvidenceRecord, corrupt_checkpoint
 from viflow_anomaly.config import EVIDENCE_BLOCK_PX
 from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.runtime.exported import HEAD_KEY
 from viflow_anomaly.runtime.openvino_network import OpenvinoNetwork, Size
 
 
@@ -23,6 +24,8 @@ class OpenvinoEvidence:
             return {"photometric": [1, counts[0], *size], "geometric": [1, counts[1], *blocks]}
 
         self._network = OpenvinoNetwork(path, record, shapes=shapes, threads=threads)
+        if HEAD_KEY not in self._network.metadata:
+            raise corrupt_checkpoint(path, "expected the export of an evidence head, found another network's")
 
     def judge(self, photometric: Float32Array, geometric: Float32Array) -> Float32Array:
         """Logits [2, H', W'] of motion and of seam."""

@@ -1,0 +1,74 @@
+"""``viflow-anomaly train-evidence``: supervised training of the evidence head on simulated recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from viflow_anomaly.cli.options import Assignments, Checkpoint, ConfigFile, Device, load_detector, settings_from
+from viflow_anomaly.cli.progress import stderr_progress
+
+
+def train_evidence(
+    data: Annotated[
+        list[Path], typer.Argument(metavar="DIR...", help="Simulated recordings with ground truth to train on.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where cues, state and the finished head go.")],
+    calibration: Annotated[
+        list[Path],
+        typer.Option(metavar="DIR", help="A folder of recordings to fit the scores on, never to train on. Repeatable."),
+    ],
+    steps: Annotated[int | None, typer.Option(min=1, help="Training steps.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Fixes everything on a CPU.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint in --out.")] = False,
+    threads: Annotated[
+        int | None,
+        typer.Option(min=1, metavar="N", help="CPU threads; another number gives other weights (default 1)."),
+    ] = None,
+    checkpoint: Checkpoint = None,
+    device: Device = None,
+    config: ConfigFile = None,
+    assignments: Assignments = None,
+) -> None:
+    """Train the head that tells motion from model error, for the network whose flow it is to judge.
+
+    It learns from simulated recordings (`viflow-anomaly simulate`), whose masks say what moves, and sees geometric cues
+    only. --calibration names folders of further recordings, a folder each. Settings are in the section
+    `evidence_training` (see `viflow-anomaly config`).
+
+    [bold]Examples[/bold]
+
+      viflow-anomaly train-evidence runs/sim/* --calibration runs/calibration --out runs/head --steps 15000
+
+      viflow-anomaly batch V1_01_easy --set evidence_head=runs/head/evidence.safetensors
+    """
+    options = {
+        "evidence_training.steps": steps,
+        "evidence_training.seed": seed,
+        "evidence_training.threads": threads,
+        "checkpoint": checkpoint,
+        "device": device,
+    }
+    settings = settings_from(config, assignments, options)
+    from viflow_anomaly.evidence_run import train_evidence as train_head
+
+    folders = [path for folder in calibration for path in sorted(folder.iterdir()) if path.is_dir()]
+    with stderr_progress() as progress:
+        task = progress.add_task("reading", total=None)
+        head = train_head(
+            data,
+            out,
+            calibration=folders,
+            detector=load_detector(settings, evidence=False),
+            training=settings.evidence_training,
+            device=settings.device,
+            resume=resume,
+            report=lambda what, done, total: progress.update(task, description=what, completed=done, total=total),
+        )
+    print(head)
+
+
+def register(app: typer.Typer) -> None:
+    app.command("train-evidence", no_args_is_help=True)(train_evidence)

@@ -1,0 +1,145 @@
+"""One training of an evidence head from recordings to a checkpoint: cues, steps, scores."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from viflow_anomaly import __version__
+from viflow_anomaly.batch import require_device
+from viflow_anomaly.checkpoint import save_evidence_head
+from viflow_anomaly.checkpoint_record import BUNDLED_EVIDENCE_NAME, EvidenceRecord, source_commit
+from viflow_anomaly.config import EvidenceTrainingConfig
+from viflow_anomaly.detector import AnomalyDetector
+from viflow_anomaly.errors import ConfigError
+from viflow_anomaly.evidence_cues import GEOMETRIC_CUES, PHOTOMETRIC_CUES
+from viflow_anomaly.evidence_data import EvidenceData, load_examples
+from viflow_anomaly.evidence_training import EvidenceTraining
+from viflow_anomaly.region_score_fit import fit_region_score, labelled_regions
+from viflow_anomaly.runtime.loading import LoadedEvidence
+from viflow_anomaly.runtime.torch_evidence import TorchEvidence
+
+Report = Callable[[str, int, int], None]
+"""Called with what is being done, how much of it is, and how much there is."""
+
+
+def train_evidence(
+    data: Sequence[Path],
+    out_dir: Path,
+    *,
+    calibration: Sequence[Path],
+    detector: AnomalyDetector,
+    training: EvidenceTrainingConfig,
+    device: str = "cpu",
+    resume: bool = False,
+    report: Report = lambda what, done, total: None,
+) -> Path:
+    """Train a head on simulated recordings, and fit its scores on others.
+
+    Args:
+        data: recordings with masks of what moves, in any order: they are taken by name.
+        out_dir: gets ``cues/`` (kept between runs), ``state.safetensors`` and the checkpoint ``evidence.safetensors``.
+        calibration: recordings to fit the scores on, never to train on.
+        detector: whose network's flow the head is to judge; its cues are learned from.
+        training: structure and steps.
+        resume: go on from ``out_dir``; a fresh directory starts anew.
+
+    Returns:
+        The checkpoint's path.
+
+    Raises:
+        ConfigError: ``training_exists``, ``resume_config_differs``, ``device_unavailable``, ``training_diverged``;
+            ``calibration_trained_on`` where a recording is in both lists.
+        DatasetError: as ``load_examples`` and ``labelled_regions``.
+        CheckpointError: ``checkpoint_corrupt`` for the state to go on from.
+    """
+    require_device(device)
+    data, calibration = (sorted(some, key=lambda path: (path.name, path)) for some in (data, calibration))
+    _require_apart(data, calibration)
+    if (out_dir / "state.safetensors").exists() and not resume:
+        raise ConfigError(
+            f"{out_dir}: expected a directory without a training run, found one; --resume goes on with it",
+            code="training_exists",
+            field="out",
+        )
+    torch.set_num_threads(training.threads)
+    model = detector.model_info
+    fingerprint: dict[str, Any] = {
+        "model": model.sha256,
+        "evidence_training": training.model_dump(mode="json", exclude={"checkpoint_every"}),
+        "data": [path.name for path in data],
+    }
+    run = EvidenceTraining(training, device=device)
+    run.restore(out_dir, fingerprint)
+    if run.step < training.steps:
+        examples = load_examples(
+            detector,
+            data,
+            out_dir / "cues",
+            every=training.every,
+            on_progress=lambda done, total: report("reading", done, total),
+        )
+
+        def on_step(step: int, loss: float) -> None:
+            report(f"training, loss {loss:.3f}", step, training.steps)
+            if step % training.checkpoint_every == 0 or step == training.steps:
+                run.save(out_dir, fingerprint)
+
+        run.run(EvidenceData(examples, training), on_step)
+    record = EvidenceRecord(
+        name=BUNDLED_EVIDENCE_NAME,
+        version=__version__,
+        sha256="0" * 64,
+        head=training.head,
+        photometric_cues=PHOTOMETRIC_CUES,
+        geometric_cues=GEOMETRIC_CUES,
+        provenance={
+            "commit": source_commit(),
+            "training": training.model_dump(mode="json"),
+            "model": {"name": model.name, "version": model.version, "sha256": model.sha256},
+            "data": {"recordings": len(data), "first": data[0].name, "last": data[-1].name},
+            "calibration": {"recordings": len(calibration), "first": calibration[0].name, "last": calibration[-1].name},
+        },
+    )
+    return _with_scores(run, record, out_dir / "evidence.safetensors", detector, calibration, report)
+
+
+def _require_apart(data: Sequence[Path], calibration: Sequence[Path]) -> None:
+    for name, some in (("data", data), ("calibration", calibration)):
+        if not some:
+            raise ConfigError(f"{name}: expected recordings, found none", code="config_invalid", field=name)
+    shared = sorted({path.name for path in data} & {path.name for path in calibration})
+    if shared:
+        raise ConfigError(
+            f"calibration: expected recordings that the head is not trained on, found {shared[0]!r} in both lists",
+            code="calibration_trained_on",
+            field="calibration",
+        )
+
+
+def _with_scores(
+    run: EvidenceTraining,
+    record: EvidenceRecord,
+    path: Path,
+    detector: AnomalyDetector,
+    calibration: Sequence[Path],
+    report: Report,
+) -> Path:
+    """Write the checkpoint with what its regions score, fitted on recordings that it has not seen."""
+    runtime = TorchEvidence(run.network.eval(), device=run.device)
+    regions = labelled_regions(
+        detector.with_evidence(LoadedEvidence(runtime, record)),
+        calibration,
+        on_progress=lambda done, total: report("calibrating", done, total),
+    )
+    counts = {"regions": len(regions.moving), "moving": int(regions.moving.sum())}
+    scored = record.model_copy(
+        update={
+            "region_score": fit_region_score(regions),
+            "provenance": {**record.provenance, "calibrated_on": counts},
+        }
+    )
+    return save_evidence_head(path, run.network, scored)
