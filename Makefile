@@ -1,7 +1,7 @@
 # make demo   a virtual environment of its own, then the main job on the bundled model and the bundled sample
 # make test   the gate: lint, format, strict types, import direction, tests with a branch-coverage floor
 # Others: lint, model (simulate, train, measure), evaluate, reproduction (the paper's table), detection-suite,
-# detection-ablations, wheel, clean, distclean. Needs Python >= 3.11, make and git; fetches from package indexes only.
+# detection-ablations, detection-robustness, thin-structures, wheel, clean, distclean. Needs Python >= 3.11, make and git; fetches from package indexes only.
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
@@ -33,7 +33,8 @@ REPRODUCTION_DIR ?= runs/reproduction
 HELD_OUT_SEQUENCES ?= 12
 HELD_OUT_FRAMES ?= 20
 
-.PHONY: demo test lint model held-out evaluate reproduction detection-suite detection-ablations wheel clean distclean
+.PHONY: demo test lint model held-out evaluate reproduction detection-suite detection-ablations detection-robustness thin-structures \
+  wheel clean distclean
 
 $(VENV)/.torch: constraints.txt
 	@echo 'making $(VENV) with torch (once, some minutes)'
@@ -116,6 +117,14 @@ detection-suite: $(VENV)/.installed-dev
 
 detection-ablations: held-out
 	$(BIN)/python benchmarks/detection_ablations.py $(MODEL_DIR)/held-out/*
+
+# What a wrong calibration costs: time offset, mounting, gyro bias, focal length, noise, brightness.
+detection-robustness: held-out
+	$(BIN)/python benchmarks/detection_robustness.py $(MODEL_DIR)/held-out/*
+
+# False alarms on railings, bare trees, poles and wires, where nothing moves by itself.
+thin-structures: $(VENV)/.installed-dev
+	$(BIN)/python benchmarks/thin_structures.py --jobs $(MODEL_JOBS)
 
 clean:
 	rm -rf build dist $(DEMO_OUT) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis .coverage

@@ -28,6 +28,9 @@ class SimulatorConfig(FrozenConfig):
     ground_truth: bool = True
     movers: tuple[int, int] = Field(default=(0, 4), description="least and most independently moving objects")
     motion: Literal["normal", "static", "rotation"] = "normal"
+    thin_structures: int = Field(
+        default=0, ge=0, le=300, description="railings, bare trees, poles, wires, scaffolds and bars beside the usual"
+    )
     imu_errors: bool = Field(default=True, description="biases, white noise, vibration; the motor's scale and noise")
     jobs: PositiveInt = Field(default=1, description="processes")
 
@@ -49,4 +52,6 @@ class SimulatorConfig(FrozenConfig):
     def sequence_record(self, sequence_seed: int) -> dict[str, Any]:
         """What the bytes of one sequence depend on, as JSON: neither the number of sequences nor of processes."""
         record = self.model_dump(mode="json", exclude={"sequences", "seed", "jobs"})
+        if not self.thin_structures:  # sequences from before there were any stay complete
+            del record["thin_structures"]
         return {**record, "sequence_seed": sequence_seed}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from viflow_anomaly.simulator.roadside import Layout
 from viflow_anomaly.simulator.scene import Scene
 from viflow_anomaly.simulator.street import street
 from viflow_anomaly.simulator.surroundings import object_materials, open_air, room
+from viflow_anomaly.simulator.thin_structures import along_the_road, beside_the_path
 from viflow_anomaly.simulator.traffic import Traffic
 
 EPOCH_NS = 1_500_000_000_000_000_000
@@ -38,7 +39,8 @@ LEAD_S = 0.5  # of IMU before the first frame and after the last
 OBJECT_MATERIALS = 14
 # One generator for each concern, so that a draw added to one does not change the others.
 STREAMS = {
-    name: index for index, name in enumerate(("rig", "motion", "movers", "scene", "imu", "camera", "noise", "motor"))
+    name: index
+    for index, name in enumerate(("rig", "motion", "movers", "scene", "imu", "camera", "noise", "motor", "thin"))
 }
 
 
@@ -94,7 +96,7 @@ def build_world(config: SimulatorConfig, seed: int) -> World:
     times_s = (stamps - stamps[frame_indices[0]]) * 1e-9
     motion, road, arc = _move(config, seed, rig, times_s)
     camera_poses = motion.poses()[frame_indices] @ rig.T_imu_cam
-    rng_movers, rng_scene = _stream(seed, "movers"), _stream(seed, "scene")
+    rng_movers, rng_scene, rng_thin = (_stream(seed, name) for name in ("movers", "scene", "thin"))
     count = int(rng_movers.integers(config.movers[0], config.movers[1] + 1))
     materials = object_materials(rng_scene, OBJECT_MATERIALS)
     names = [material.name for material in materials]
@@ -103,6 +105,7 @@ def build_world(config: SimulatorConfig, seed: int) -> World:
         movers = airborne_movers(rng_movers, count, rig.camera, camera_poses, frame_times, names)
         surroundings = room if rng_scene.random() < 0.7 else open_air
         scene = surroundings(rng_scene, camera_path, movers, materials)
+        thin = beside_the_path(rng_thin, config.thin_structures, camera_poses, movers, names)
     else:
         layout = Layout.draw(rng_scene)
         oncoming = (layout.left_edge * 2 + layout.right_edge) / 3
@@ -112,6 +115,8 @@ def build_world(config: SimulatorConfig, seed: int) -> World:
         )
         movers = traffic.draw(count)
         scene = street(rng_scene, road, layout, camera_path, movers, materials)
+        thin = along_the_road(rng_thin, config.thin_structures, road, layout, arc_at_frames, camera_path, movers, names)
+    scene = replace(scene, solids=(*scene.solids, *thin))
     return World(rig, motion, stamps, frame_indices, camera_poses, scene)
 
 
