@@ -281,7 +281,7 @@ class DetectorConfig(FrozenConfig):
         "alone (the paper's); auto: the head, where the network knows depth and the head was loaded",
     )
     photometric_compensation: bool = Field(
-        default=False, description="a gain and a bias between the images are fitted before the residual"
+        default=True, description="a gain and a bias between the images are fitted before the residual"
     )
     residual: Literal["winner", "minimum"] = Field(
         default="winner", description="minimum: the pixelwise smallest over all hypotheses and the corrected one"

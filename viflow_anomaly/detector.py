@@ -301,6 +301,8 @@ class AnomalyDetector:
         reconstruction, inside = reconstruct(pair.target.image, coordinates)
         if (analyzed := model_input.view.analyzed()) is not None:
             inside &= analyzed
+        if self.config.photometric_compensation:
+            reconstruction = compensate_exposure(reconstruction, source, inside)
         residual = self._residual(pair, model_input, predicted, reconstruction, inside)
         half_range = half_range_gray(source)
         normalised = texture_normalised(residual, half_range, self.config.regions.texture_softening_gray)
@@ -315,20 +317,16 @@ class AnomalyDetector:
         reconstruction: Float32Array,
         inside: NDArray[np.bool_],
     ) -> Float32Array:
-        """[H, W] of the winner, or the smallest over all hypotheses; an exposure may be compensated first."""
+        """[H, W] of the winner, or the smallest over all hypotheses."""
         source = pair.source.image
-
-        def difference(rebuilt: Float32Array, where: NDArray[np.bool_]) -> Float32Array:
-            if self.config.photometric_compensation:
-                rebuilt = compensate_exposure(rebuilt, source, where)
-            return photometric_residual(source, rebuilt, where)
-
-        residual = difference(reconstruction, inside)
+        residual = photometric_residual(source, reconstruction, inside)
         for flow_px in predicted.hypotheses_px if self.config.residual == "minimum" else ():
             coordinates = model_input.view.target_coordinates(flow_px, predicted.stride)
             rebuilt, reached = reconstruct(pair.target.image, coordinates)
             both = inside & reached
-            np.minimum(residual, difference(rebuilt, both), out=residual, where=both)
+            if self.config.photometric_compensation:
+                rebuilt = compensate_exposure(rebuilt, source, both)
+            np.minimum(residual, photometric_residual(source, rebuilt, both), out=residual, where=both)
         return residual
 
     def _judge_input(self, pair: FramePair, model_input: ModelInput) -> tuple[tuple[Reason, ...], bool]:

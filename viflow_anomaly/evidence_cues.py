@@ -36,6 +36,8 @@ GEOMETRIC_CUES = (
     "inverse depth",
     "inside",
     "predicted flow",
+    "local flow across",
+    "local flow along",
 )
 MIN_PARALLAX_PX = 0.05
 """Below it an epipolar line has no direction; along is then along x."""
@@ -55,7 +57,7 @@ class EvidenceCues(NamedTuple):
 
     Attributes:
         photometric: [3, H', W'] float32, ``PHOTOMETRIC_CUES``.
-        geometric: [10, H' / 4, W' / 4] float32, ``GEOMETRIC_CUES``.
+        geometric: [12, H' / 4, W' / 4] float32, ``GEOMETRIC_CUES``.
     """
 
     photometric: Float32Array
@@ -87,7 +89,7 @@ def evidence_cues(
         focal_px: that the network takes the view for.
     """
     source, inside = _padded(reconstructed.source), _padded(reconstructed.inside.astype(np.uint8), outside=True)
-    rebuilt = _padded(cv2.convertScaleAbs(reconstructed.reconstruction))
+    rebuilt = _padded(np.clip(np.rint(reconstructed.reconstruction), 0, 255).astype(np.uint8))
     np.copyto(rebuilt, source, where=inside == 0)
     height, width = source.shape
     photometric = np.empty((len(PHOTOMETRIC_CUES), height, width), dtype=np.float32)
@@ -100,7 +102,11 @@ def evidence_cues(
     geometric = np.empty((len(GEOMETRIC_CUES), *blocks[::-1]), dtype=np.float32)
     remaining = measure_remaining_flow(source, rebuilt, block_px=EVIDENCE_BLOCK_PX)
     slope, log_ratio, log_depth = _parallax(predicted, view, blocks, focal_px)
-    _split_along(remaining.flow_px, slope, geometric)
+    line = _epipolar_lines(slope)
+    _split_along(remaining.flow_px, line, geometric[0:2])
+    _split_along(remaining.local_flow_px, line, geometric[10:12])
+    _bound(np.linalg.norm(remaining.flow_px, axis=-1), HALF_REMAINING_PX, geometric[2])
+    _bound(line.parallax_px, HALF_PARALLAX_PX, geometric[5])
     _bound(remaining.mismatch_gray, HALF_MISMATCH_GRAY, geometric[3])
     _bound(remaining.texture_gray2, HALF_TEXTURE_GRAY2, geometric[4])
     np.clip(log_ratio, -1, 1, out=geometric[6])
@@ -145,16 +151,26 @@ def _parallax(
     return sampled[..., :2], sampled[..., 2], sampled[..., 3]
 
 
-def _split_along(flow_px: Float32Array, slope_px: Float32Array, geometric: Float32Array) -> None:
-    """Remaining flow across and along the epipolar line, its length, and the parallax (cues 0, 1, 2 and 5)."""
-    sx, sy = slope_px[..., 0] + np.float32(MIN_PARALLAX_PX), slope_px[..., 1]
-    length = np.sqrt(sx * sx + sy * sy)
+class _EpipolarLines(NamedTuple):
+    """Unit vectors [h, w] of x and y along which a static point may move, and by how much it does as its depth says."""
+
+    x: Float32Array
+    y: Float32Array
+    parallax_px: Float32Array
+
+
+def _epipolar_lines(slope_px: Float32Array) -> _EpipolarLines:
+    x, y = slope_px[..., 0] + np.float32(MIN_PARALLAX_PX), slope_px[..., 1]
+    length = np.sqrt(x * x + y * y)
     inverse = 1 / np.maximum(length, np.float32(1e-6))
+    return _EpipolarLines(x * inverse, y * inverse, length)
+
+
+def _split_along(flow_px: Float32Array, line: _EpipolarLines, out: Float32Array) -> None:
+    """[2, h, w]: how far a flow goes across and along the line, bounded."""
     u, v = flow_px[..., 0], flow_px[..., 1]
-    _bound((v * sx - u * sy) * inverse, HALF_REMAINING_PX, geometric[0])
-    _bound((u * sx + v * sy) * inverse, HALF_REMAINING_PX, geometric[1])
-    _bound(np.sqrt(u * u + v * v), HALF_REMAINING_PX, geometric[2])
-    _bound(length, HALF_PARALLAX_PX, geometric[5])
+    _bound(v * line.x - u * line.y, HALF_REMAINING_PX, out[0])
+    _bound(u * line.x + v * line.y, HALF_REMAINING_PX, out[1])
 
 
 def _on_blocks(

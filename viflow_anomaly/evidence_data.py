@@ -8,6 +8,7 @@ folder holds ``photometric``, ``geometric`` (-1..1 as 0..255) and ``truth`` of e
 from __future__ import annotations
 
 import io
+import json
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -35,11 +36,11 @@ SEAM_REACH_PX = 3
 BYTE_SCALE = np.float32(127.5)
 TRIES = 3
 """A crop without a mover is drawn anew this often: most of a picture rests."""
-ACROSS = GEOMETRIC_CUES.index("remaining flow across")
+ACROSS = [k for k, name in enumerate(GEOMETRIC_CUES) if name.endswith("across")]
 
 
 class EvidenceBatch(NamedTuple):
-    """photometric [B, 3, h, w] and geometric [B, 10, h/4, w/4] float32 in -1..1, truth [B, h, w] uint8."""
+    """photometric [B, 3, h, w] and geometric [B, 12, h/4, w/4] float32 in -1..1, truth [B, h, w] uint8."""
 
     photometric: Float32Array
     geometric: Float32Array
@@ -48,7 +49,7 @@ class EvidenceBatch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Examples:
-    """The pairs of one recording: photometric [N, 3, H', W'], geometric [N, 10, H'/4, W'/4], truth [N, H', W']."""
+    """The pairs of one recording: photometric [N, 3, H', W'], geometric [N, 12, H'/4, W'/4], truth [N, H', W']."""
 
     photometric: Uint8Array
     geometric: Uint8Array
@@ -106,27 +107,57 @@ def _as_bytes(cues: Float32Array) -> Uint8Array:
 
 
 def kept_examples(detector: AnomalyDetector, path: Path, folder: Path, *, every: int = 1) -> Examples:
-    """``extract_examples``, kept in ``folder``; what is there is read.
+    """``extract_examples``, kept in ``folder``; what an earlier run left there is read if it would be the same.
 
     Raises:
         DatasetError: as ``extract_examples``; ``evidence_data_malformed`` for a file there that is none of these.
     """
-    kept = folder / f"{path.name}.npz"
-    if not kept.exists():
-        examples = extract_examples(detector, path, every=every)
-        buffer = io.BytesIO()
-        np.savez(buffer, photometric=examples.photometric, geometric=examples.geometric, truth=examples.truth)
-        write_atomically(kept, buffer.getvalue())
-        return examples
+    kept, about = folder / f"{path.name}.npz", _made_with(detector, every)
+    if kept.exists():
+        examples = _read_kept(kept, about)
+        if examples is not None:
+            return examples
+    examples = extract_examples(detector, path, every=every)
+    buffer = io.BytesIO()
+    np.savez(
+        buffer,
+        about=np.array(about),
+        photometric=examples.photometric,
+        geometric=examples.geometric,
+        truth=examples.truth,
+    )
+    write_atomically(kept, buffer.getvalue())
+    return examples
+
+
+def _made_with(detector: AnomalyDetector, every: int) -> str:
+    """All that the cues of a recording depend on besides itself."""
+    config = detector.config
+    about = {
+        "model": detector.model_info.sha256,
+        "cues": (PHOTOMETRIC_CUES, GEOMETRIC_CUES),
+        "correction": config.correction.model_dump(mode="json"),
+        "softening": config.regions.texture_softening_gray,
+        "residual": (config.residual, config.photometric_compensation),
+        "every": every,
+    }
+    return json.dumps(about, sort_keys=True)
+
+
+def _read_kept(kept: Path, about: str) -> Examples | None:
+    """None where it was made otherwise."""
     try:
         with np.load(kept, allow_pickle=False) as arrays:
+            if str(arrays["about"]) != about:
+                return None
             examples = Examples(arrays["photometric"], arrays["geometric"], arrays["truth"])
+        count, height, width = examples.truth.shape
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as err:
         raise _malformed(kept, str(err)) from err
-    count, height, width = examples.truth.shape
+    blocks = (height // EVIDENCE_BLOCK_PX, width // EVIDENCE_BLOCK_PX)
     shapes = {
         "photometric": (count, len(PHOTOMETRIC_CUES), height, width),
-        "geometric": (count, len(GEOMETRIC_CUES), height // EVIDENCE_BLOCK_PX, width // EVIDENCE_BLOCK_PX),
+        "geometric": (count, len(GEOMETRIC_CUES), *blocks),
     }
     for name, shape in shapes.items():
         if getattr(examples, name).shape != shape:

@@ -48,6 +48,7 @@ REGION_FEATURES = (
     "texture",
     "parallax",
     "inside",
+    "local flow across",
 )
 """What a score is fitted to; the cues are means over the region, bounded as in ``evidence_cues``."""
 CUE_FEATURES = REGION_FEATURES[6:]
@@ -62,7 +63,7 @@ class MotionMaps(NamedTuple):
 
 
 class MeasuredRegion(NamedTuple):
-    """A component before it has a score: ``features`` [12] are ``REGION_FEATURES``, ``outline`` is its box's mask."""
+    """A component before it has a score: ``features`` [13] are ``REGION_FEATURES``, ``outline`` is its box's mask."""
 
     component: Component
     box: BoundingBox
@@ -154,7 +155,7 @@ def _labels(mask: BoolArray, seam: Float32Array) -> IndexArray:
 def _features(
     component: Component, maps: MotionMaps, cues: EvidenceCues, outline: BoolArray, shape: Shape
 ) -> Float64Array:
-    """[12], in the order of ``REGION_FEATURES``."""
+    """[13], in the order of ``REGION_FEATURES``."""
     y, x = component
     motion = maps.motion[y, x]
     blocks = (y // EVIDENCE_BLOCK_PX, x // EVIDENCE_BLOCK_PX)

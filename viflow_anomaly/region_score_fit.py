@@ -23,7 +23,7 @@ NEWTON_ROUNDS = 25
 
 
 class LabelledRegions(NamedTuple):
-    """features [N, 12] (``REGION_FEATURES``), moving [N]."""
+    """features [N, 13] (``REGION_FEATURES``), moving [N]."""
 
     features: Float64Array
     moving: NDArray[np.bool_]

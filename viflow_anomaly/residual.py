@@ -20,7 +20,7 @@ BOUNDARY_TOLERANCE_PX = 1e-3
 """float32 coordinates a thousand pixels from the origin carry errors of 1e-4; such a coordinate is still inside."""
 
 
-EXPOSURE_SAMPLES = 5_000
+EXPOSURE_SAMPLES = 2_000
 MIN_EXPOSURE_SAMPLES = 100
 EXPOSURE_ROUNDS = 6
 EXPOSURE_TOLERANCE_GRAY = 6.0

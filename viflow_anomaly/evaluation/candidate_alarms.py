@@ -30,7 +30,7 @@ PLAIN_MIN_RESIDUAL_GRAY = 12.0
 """Of the residual that is not normalised: twice what the normalised one is cut at by default."""
 
 # What makes a detector plain. A field that changes the evidence (another kind of it than the residual) belongs here.
-PLAIN_EVIDENCE: dict[str, Any] = {"photometric_compensation": False, "residual": "winner"}
+PLAIN_EVIDENCE: dict[str, Any] = {"evidence": "residual", "photometric_compensation": False, "residual": "winner"}
 PLAIN_REGIONS: dict[str, Any] = {
     "texture_softening_gray": 0.0,
     "min_residual_gray": PLAIN_MIN_RESIDUAL_GRAY,

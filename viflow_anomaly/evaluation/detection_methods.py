@@ -163,6 +163,7 @@ def plain_residual(detector: AnomalyDetector) -> RivalMethod:
             update={
                 "correction": config.correction.model_copy(update={"enabled": False}),
                 "regions": config.regions.model_copy(update={"texture_softening_gray": 0.0}),
+                "evidence": "residual",
                 "photometric_compensation": False,
                 "residual": "winner",
             }

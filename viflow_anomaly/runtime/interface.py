@@ -57,4 +57,4 @@ class EvidenceRuntime(Protocol):
     """Runs one evidence head; threads may share it, too."""
 
     def judge(self, photometric: Float32Array, geometric: Float32Array) -> Float32Array:
-        """Logits [2, H', W'] of motion and of seam, for cues [3, H', W'] and [10, H' / 4, W' / 4]."""
+        """Logits [2, H', W'] of motion and of seam, for cues [3, H', W'] and [12, H' / 4, W' / 4]."""
