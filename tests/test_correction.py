@@ -71,6 +71,7 @@ def test_a_motion_within_the_priors_reach_is_found() -> None:
     assert error_px(corrected.flow_px, seen) < 0.05
     assert corrected.inlier_share > 0.95
     assert corrected.shift_px > 0.5
+    assert abs(corrected.turned_rad - np.linalg.norm((0.002, -0.001, 0.001))) < 2e-4
 
 
 def test_the_true_start_stays() -> None:

@@ -100,6 +100,12 @@ class TestResampled:
         window = build_motion_window(make_pair(regular(100), lambda t: np.tile(t[:, None], (1, 6)) + 5.0), config)
         np.testing.assert_allclose(window.values[:, 0] - 5.0, [-0.01, 0.005, 0.015, 0.025, 0.035, 0.045], atol=1e-6)
 
+    def test_the_turn_rate_is_the_norm_of_the_mean_rate_between_the_frames(self) -> None:
+        times_s = regular(200)
+        window = build_motion_window(make_pair(times_s, swinging), SENSOR)
+        mean = trapezoid_integral(times_s, swinging(times_s), 0.0, 0.05)[:3] / 0.05
+        assert window.turn_rate_rad_s == pytest.approx(float(np.linalg.norm(mean)), rel=1e-6)
+
     def test_samples_far_from_the_window_change_nothing(self) -> None:
         few = build_motion_window(make_pair(regular(200, -0.06, 0.06), swinging), SENSOR)
         many = build_motion_window(make_pair(regular(200, -5.0, 5.0), swinging), SENSOR)

@@ -269,11 +269,40 @@ class CorrectionConfig(FrozenConfig):
     )
 
 
+class QualityConfig(FrozenConfig):
+    """Which pairs are not judged, or with less trust; see ``pair_quality``.
+
+    A second limit (``abstain_...``) counts where the first is passed, too.
+    """
+
+    abstain_exposure_jump_gray: float = Field(default=110.0, ge=0, description="a larger change of the mean abstains")
+    max_clipped_share: float = Field(
+        default=0.35, ge=0, le=1, description="black or white pixels of an image; a jump of exposure with more abstains"
+    )
+    max_contrast_ratio: float = Field(
+        default=2.2, ge=1, description="of the images' deviations; a jump of exposure with more abstains"
+    )
+    max_blur_ratio: float = Field(default=1.6, ge=1, description="sharpness of one image over the other's")
+    abstain_blur_ratio: float = Field(default=5.0, ge=1, description="beyond it a blurred pair is not judged")
+    frozen_turn_rate_rad_s: float = Field(
+        default=0.1, ge=0, description="of the gyro; more than a bias, so that identical images contradict it"
+    )
+    max_turn_error_rad_s: float = Field(default=0.15, ge=0, description="of the corrected rotation from the gyro's")
+    abstain_turn_error_rad_s: float = Field(default=0.5, ge=0, description="beyond it the pair is not judged")
+    abstain_inlier_share: float = Field(
+        default=0.1, ge=0, le=1, description="of the correction; with less the images contradict the IMU for good"
+    )
+    min_confidence: float = Field(
+        default=0.2, ge=0, le=1, description="mean of the measured flow's, from which on images may overrule the IMU"
+    )
+
+
 class DetectorConfig(FrozenConfig):
     """Everything a detection depends on besides the weights and the pair."""
 
     regions: RegionConfig = RegionConfig()
     correction: CorrectionConfig = CorrectionConfig()
+    quality: QualityConfig = QualityConfig()
     include_masks: bool = False
     evidence: Literal["auto", "learned", "residual"] = Field(
         default="auto",
@@ -288,7 +317,7 @@ class DetectorConfig(FrozenConfig):
     )
     min_texture_gray: float = Field(default=2.0, ge=0, description="standard deviation below which nothing is judged")
     min_overlap: float = Field(default=0.05, ge=0, le=1, description="share of the analysed pixels still in the target")
-    max_exposure_jump_gray: float = Field(default=40.0, ge=0, description="change of the mean between the frames")
+    max_exposure_jump_gray: float = Field(default=20.0, ge=0, description="change of the mean between the frames")
 
 
 EVIDENCE_BLOCK_PX = 4

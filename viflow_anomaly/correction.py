@@ -47,6 +47,8 @@ class Correction(NamedTuple):
         inlier_share: confident cells that agree with ``flow_px``, 0..1; 0 where too little was confident.
         shift_px: how far the correction moved the prediction, |du| + |dv|, mean over cells.
         converged: False: nothing to measure, or the prediction was no worse; it stands as it was.
+        turned_rad: angle between the rotation of ``motion`` and the gyro's; 0 where that stands, and where the network
+            gives flow only: without depth a rotation would also stand for the camera's translation.
     """
 
     flow_px: Float32Array
@@ -56,6 +58,7 @@ class Correction(NamedTuple):
     converged: bool
     inverse_depth: Float32Array | None = None
     log_depth_ratio: Float32Array | None = None
+    turned_rad: float = 0.0
 
 
 def rigid_flow_px(
@@ -121,6 +124,8 @@ def correct_motion(
     after = rigid_flow_px(rays, inverse_depth, motion, focal_px)
     corrected = _accepted(before, after, measured, config, start, motion)
     corrected = corrected._replace(inverse_depth=inverse_depth, log_depth_ratio=np.zeros_like(inverse_depth))
+    if corrected.converged:
+        corrected = corrected._replace(turned_rad=float(np.linalg.norm(turned)))
     if not corrected.converged or not config.depth_rounds:
         return corrected
     log_ratio = _log_depth_ratio(rays, inverse_depth, motion, measured, focal_px, config)

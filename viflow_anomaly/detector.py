@@ -7,13 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple, Self
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from viflow_anomaly.checkpoint_record import CheckpointRecord, EvidenceRecord
-from viflow_anomaly.config import CorrectionConfig, DetectorConfig, MotorSource, RuntimeName
-from viflow_anomaly.correction import Correction
+from viflow_anomaly.config import DetectorConfig, MotorSource, RuntimeName
 from viflow_anomaly.detection import (
     AnalyzedRegion,
     Detection,
@@ -34,7 +32,9 @@ from viflow_anomaly.evidence_cues import (
 )
 from viflow_anomaly.geometry import Float32Array, pixel_grid
 from viflow_anomaly.model_input import ModelInput, prepare
+from viflow_anomaly.motion_input import MotionWindow
 from viflow_anomaly.moving_regions import MotionMaps, find_moving_regions
+from viflow_anomaly.pair_quality import Finding, judge_correction, judge_images, judge_window
 from viflow_anomaly.prediction import PredictedFlow, predict_flow
 from viflow_anomaly.regions import Region, find_regions
 from viflow_anomaly.residual import (
@@ -216,12 +216,13 @@ class AnomalyDetector:
         inferred = time.perf_counter()
         x, y, region_width, region_height = model_input.view.region()
         summary = _summary(residual, inside, self.config.min_overlap, region_width * region_height)
-        reasons, abstained = self._judge_input(pair, model_input)
+        findings = _judge_input(pair, model_input.window, self.config)
         if summary is None:
             finite = bool(np.isfinite(predicted.flow_px).all())
-            reasons, abstained = (*reasons, NOTHING_IN_COMMON if finite else NOT_FINITE), True
-        elif not abstained:
-            reasons = (*reasons, *_doubts(predicted.correction, self.config.correction))
+            findings = (*findings, Finding(NOTHING_IN_COMMON if finite else NOT_FINITE, abstain=True))
+        elif not any(finding.abstain for finding in findings):
+            findings = (*findings, *_doubts(predicted, model_input.window, self.config))
+        abstained = any(finding.abstain for finding in findings)
         rois: tuple[Roi, ...] = ()
         if not abstained:
             image = ImageSize(width=residual.shape[1], height=residual.shape[0])
@@ -242,7 +243,7 @@ class AnomalyDetector:
             target_timestamp_ns=pair.target.timestamp_ns,
             image=ImageSize(width=width, height=height),
             status="abstained" if abstained else "ok",
-            reasons=reasons,
+            reasons=tuple(finding.reason for finding in findings),
             model=self.model_info,
             rois=rois,
             region_analyzed=AnalyzedRegion(x=x, y=y, width=region_width, height=region_height),
@@ -329,34 +330,11 @@ class AnomalyDetector:
             np.minimum(residual, photometric_residual(source, rebuilt, both), out=residual, where=both)
         return residual
 
-    def _judge_input(self, pair: FramePair, model_input: ModelInput) -> tuple[tuple[Reason, ...], bool]:
-        """What lowers trust in this pair, and whether it must not be judged."""
-        faults = model_input.window.faults
-        reasons = [Reason(code=fault.code, message=fault.message) for fault in faults]
-        abstained = any(fault.severity == "abstain" for fault in faults)
-        (source_mean, source_texture), (target_mean, target_texture) = (
-            (float(value[0, 0]) for value in cv2.meanStdDev(image)) for image in (pair.source.image, pair.target.image)
-        )
-        texture = min(source_texture, target_texture)
-        if texture < self.config.min_texture_gray:
-            reasons.append(
-                Reason(
-                    code="no_texture",
-                    message=f"expected a deviation of at least {self.config.min_texture_gray} gray levels in both "
-                    f"images, found {texture:.1f}: a uniform image shows no motion",
-                )
-            )
-            abstained = True
-        jump = abs(source_mean - target_mean)
-        if jump > self.config.max_exposure_jump_gray:
-            reasons.append(
-                Reason(
-                    code="exposure_jump",
-                    message=f"the mean brightness changed by {jump:.0f} gray levels between the frames, more than "
-                    f"{self.config.max_exposure_jump_gray:.0f}: the residual is not motion alone",
-                )
-            )
-        return tuple(reasons), abstained
+
+def _judge_input(pair: FramePair, window: MotionWindow, config: DetectorConfig) -> tuple[Finding, ...]:
+    """What can be said against the pair before anything is predicted."""
+    of_images = judge_images(pair.source.image, pair.target.image, window, config)
+    return (*judge_window(window), *of_images)
 
 
 def _require_our_cues(record: EvidenceRecord) -> None:
@@ -375,16 +353,11 @@ def _sigmoid(logits: Float32Array) -> Float32Array:
     return np.asarray(1 / (1 + np.exp(-np.clip(logits, -80, 80))), dtype=np.float32)
 
 
-def _doubts(correction: Correction | None, config: CorrectionConfig) -> tuple[Reason, ...]:
-    """What the attempt to correct the motion on the target image says against the answer."""
-    if correction is None or correction.inlier_share >= config.min_inlier_share:
+def _doubts(predicted: PredictedFlow, window: MotionWindow, config: DetectorConfig) -> tuple[Finding, ...]:
+    """What the correction says against the pair; nothing with correction off."""
+    if predicted.correction is None or predicted.measured is None:
         return ()
-    if correction.inlier_share:
-        found = f"found that {100 * correction.inlier_share:.0f} % agree with any motion of the camera"
-    else:
-        found = "found too little texture in common; the prediction stands as it was"
-    wanted = f"expected at least {100 * config.min_inlier_share:.0f} % of what can be measured between the images"
-    return (Reason(code="motion_unconfirmed", message=f"{wanted} to confirm the camera's motion, {found}"),)
+    return judge_correction(predicted.correction, predicted.measured, window.interval_s, config)
 
 
 def _summary(

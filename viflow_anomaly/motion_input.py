@@ -63,11 +63,13 @@ class MotionWindow:
             configuration asks for them and the mounting is known, else in IMU axes.
         interval_s: time from the source frame to the target frame.
         faults: what lowers trust in the window or forbids to judge the pair; empty when all is well.
+        turn_rate_rad_s: how fast the gyro turned between the frames, mean over the interval; back and forth cancel.
     """
 
     values: Float32Array
     interval_s: float
     faults: tuple[ImuFault, ...] = ()
+    turn_rate_rad_s: float = 0.0
 
 
 class _Signal(NamedTuple):
@@ -107,7 +109,7 @@ def build_motion_window(pair: FramePair, config: MotionWindowConfig) -> MotionWi
     rows, mounting_faults = _in_requested_axes(rows, pair.camera, config)
     values = rows.astype(np.float32)
     values.setflags(write=False)
-    return MotionWindow(values=values, interval_s=interval_s, faults=(*faults, *mounting_faults))
+    return MotionWindow(values, interval_s, (*faults, *mounting_faults), _turn_rate_rad_s(signal, interval_s))
 
 
 def _reach(interval_s: float, config: MotionWindowConfig) -> tuple[float, float]:
@@ -239,6 +241,11 @@ def _integral_at(edges_s: Float64Array, signal: _Signal) -> Float64Array:
     elapsed_s = (edges_s - times_s[sample])[:, None]
     slope = np.where(elapsed_s < 0, 0.0, slopes[sample])
     return np.asarray(at_samples[sample] + elapsed_s * (values[sample] + 0.5 * elapsed_s * slope))
+
+
+def _turn_rate_rad_s(signal: _Signal, interval_s: float) -> float:
+    start, end = _integral_at(np.array([0.0, interval_s]), signal)[:, :3]
+    return float(np.linalg.norm(end - start)) / interval_s
 
 
 def _paper_rows(signal: _Signal, interval_s: float, blocks: PaperBlocks) -> Float64Array:
