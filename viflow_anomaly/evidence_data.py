@@ -147,12 +147,12 @@ def _made_with(detector: AnomalyDetector, every: int) -> str:
 def _read_kept(kept: Path, about: str) -> Examples | None:
     """None where it was made otherwise."""
     try:
-        with np.load(kept, allow_pickle=False) as arrays:
+        with np.load(io.BytesIO(kept.read_bytes()), allow_pickle=False) as arrays:
             if str(arrays["about"]) != about:
                 return None
             examples = Examples(arrays["photometric"], arrays["geometric"], arrays["truth"])
         count, height, width = examples.truth.shape
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as err:
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as err:
         raise _malformed(kept, str(err)) from err
     blocks = (height // EVIDENCE_BLOCK_PX, width // EVIDENCE_BLOCK_PX)
     shapes = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from viflow_anomaly.region_score_fit import fit_region_score, labelled_regions
 from viflow_anomaly.runtime.loading import LoadedEvidence
 from viflow_anomaly.runtime.torch_evidence import TorchEvidence
 
+LOG_EVERY = 100
 Report = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is, and how much there is."""
 
@@ -41,7 +43,8 @@ def train_evidence(
 
     Args:
         data: recordings with masks of what moves, in any order: they are taken by name.
-        out_dir: gets ``cues/`` (kept between runs), ``state.safetensors`` and the checkpoint ``evidence.safetensors``.
+        out_dir: gets ``cues/`` (kept between runs), ``state.safetensors``, ``metrics.jsonl`` and the checkpoint
+            ``evidence.safetensors``.
         calibration: recordings to fit the scores on, never to train on.
         detector: whose network's flow the head is to judge; its cues are learned from.
         training: structure and steps.
@@ -83,8 +86,14 @@ def train_evidence(
             on_progress=lambda done, total: report("reading", done, total),
         )
 
+        losses: list[float] = []
+
         def on_step(step: int, loss: float) -> None:
             report(f"training, loss {loss:.3f}", step, training.steps)
+            losses.append(loss)
+            if step % LOG_EVERY == 0:
+                _log(out_dir / "metrics.jsonl", step, sum(losses) / len(losses))
+                losses.clear()
             if step % training.checkpoint_every == 0 or step == training.steps:
                 run.save(out_dir, fingerprint)
 
@@ -105,6 +114,12 @@ def train_evidence(
         },
     )
     return _with_scores(run, record, out_dir / "evidence.safetensors", detector, calibration, report)
+
+
+def _log(path: Path, step: int, loss: float) -> None:
+    """One line, the mean loss of the last steps; a resumed run logs what it repeats once more."""
+    with path.open("a", encoding="utf-8") as metrics:
+        metrics.write(json.dumps({"step": step, "loss": round(loss, 6)}) + "\n")
 
 
 def _require_apart(data: Sequence[Path], calibration: Sequence[Path]) -> None:

@@ -46,7 +46,8 @@ class EvidenceTraining:
         """
         self.network.train()
         while self.step < self.config.steps:
-            on_step(self.step, self.train_step(data.sample(self.step)))
+            loss = self.train_step(data.sample(self.step))
+            on_step(self.step, loss)
         self.network.eval()
 
     def train_step(self, batch: EvidenceBatch) -> float:

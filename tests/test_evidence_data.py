@@ -1,0 +1,169 @@
+"""Examples for the evidence head: what is true of a pixel, what is kept on disk, what a crop is."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evidence_world import SMALL, recording
+from simulated_truth import add_ground_truth
+from worlds import make_world
+
+from viflow_anomaly.config import CorrectionConfig, DetectorConfig
+from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
+from viflow_anomaly.datasets.ground_truth_png import write_instances_png
+from viflow_anomaly.detector import AnomalyDetector
+from viflow_anomaly.errors import DatasetError
+from viflow_anomaly.evidence_cues import GEOMETRIC_CUES
+from viflow_anomaly.evidence_data import (
+    ACROSS,
+    IGNORED,
+    MOVING,
+    SEAM,
+    EvidenceData,
+    Examples,
+    extract_examples,
+    kept_examples,
+    load_examples,
+    truth_of,
+)
+
+
+@pytest.fixture(scope="module")
+def detector() -> AnomalyDetector:
+    return AnomalyDetector.from_checkpoint(with_evidence=False)
+
+
+def truth_folder(path: Path) -> GroundTruthFolder:
+    found = GroundTruthFolder.find(path)
+    assert found is not None
+    return found
+
+
+def stamps(truth: GroundTruthFolder) -> list[int]:
+    return sorted(int(path.stem) for path in (truth.folder / "instances").glob("*.png"))
+
+
+def test_movers_count_and_slow_ones_do_not(tmp_path: Path) -> None:
+    truth = truth_folder(recording(tmp_path / "drone_1"))
+    seen = truth_of(truth, stamps(truth)[0])
+    assert (seen[10:20, 30:44] == MOVING).all()
+    assert (seen[30:40, 5:15] == IGNORED).all()
+    assert np.count_nonzero(seen) == 140 + 100
+
+
+def test_where_two_movers_touch_there_is_a_seam(tmp_path: Path) -> None:
+    truth = truth_folder(recording(tmp_path / "drone_1"))
+    stamp = stamps(truth)[0]
+    instances = truth.instances(stamp)
+    instances[10:20, 44:50] = 3
+    write_instances_png(truth.folder / "instances" / f"{stamp}.png", instances)
+    lines = (truth.folder / "objects.csv").read_text()
+    (truth.folder / "objects.csv").write_text(lines + f"{stamp},3,60,44,10,49,19,5.0\n")
+    seen = truth_of(truth_folder(tmp_path / "drone_1"), stamp)
+    assert (seen[10:20, 41:47] == MOVING | SEAM).all()
+    assert (seen[10:20, 30:41] == MOVING).all()
+    assert (seen[10:20, 47:50] == MOVING).all()
+
+
+def test_examples_are_bytes_of_the_detectors_cues(tmp_path: Path, detector: AnomalyDetector) -> None:
+    examples = extract_examples(detector, recording(tmp_path / "drone_1"))
+    count, height, width = examples.truth.shape
+    assert (count, height % 32, width % 32) == (2, 0, 0)
+    assert examples.photometric.shape == (2, 3, height, width)
+    assert examples.geometric.shape == (2, len(GEOMETRIC_CUES), height // 4, width // 4)
+    assert (examples.truth & MOVING).any()
+
+
+def test_what_was_kept_is_read_as_long_as_it_would_be_the_same(tmp_path: Path, detector: AnomalyDetector) -> None:
+    path, kept = recording(tmp_path / "drone_1"), tmp_path / "cues"
+    first = kept_examples(detector, path, kept)
+    file = kept / "drone_1.npz"
+    before = file.stat().st_mtime_ns
+    again = kept_examples(detector, path, kept)
+    assert file.stat().st_mtime_ns == before
+    np.testing.assert_array_equal(first.geometric, again.geometric)
+    other = detector.with_config(DetectorConfig(correction=CorrectionConfig(depth_rounds=0)))
+    kept_examples(other, path, kept)
+    assert file.stat().st_mtime_ns != before
+    assert [one.name for one in kept.iterdir()] == ["drone_1.npz"]
+
+
+def test_a_damaged_file_is_named(tmp_path: Path, detector: AnomalyDetector) -> None:
+    path, kept = recording(tmp_path / "drone_1"), tmp_path / "cues"
+    kept_examples(detector, path, kept)
+    file = kept / "drone_1.npz"
+    data = file.read_bytes()
+    for damaged in (data[: len(data) // 2], b"no archive", b""):
+        file.write_bytes(damaged)
+        with pytest.raises(DatasetError, match=r"drone_1\.npz.*delete it") as caught:
+            kept_examples(detector, path, kept)
+        assert caught.value.code == "evidence_data_malformed"
+
+
+def test_arrays_of_another_shape_are_named(tmp_path: Path, detector: AnomalyDetector) -> None:
+    path, kept = recording(tmp_path / "drone_1"), tmp_path / "cues"
+    examples = kept_examples(detector, path, kept)
+    with np.load(kept / "drone_1.npz") as arrays:
+        about = arrays["about"]
+    assert json.loads(str(about))["every"] == 1
+    np.savez(
+        kept / "drone_1.npz",
+        about=about,
+        photometric=examples.photometric[:, :2],
+        geometric=examples.geometric,
+        truth=examples.truth,
+    )
+    with pytest.raises(DatasetError, match="photometric of shape"):
+        kept_examples(detector, path, kept)
+
+
+def test_recordings_need_movers_and_names_of_their_own(tmp_path: Path, detector: AnomalyDetector) -> None:
+    static = add_ground_truth(tmp_path / "static", make_world(frames=2))
+    with pytest.raises(DatasetError):
+        extract_examples(detector, static)
+    one, two = recording(tmp_path / "a" / "drone_1"), recording(tmp_path / "b" / "drone_1")
+    with pytest.raises(DatasetError, match="several 'drone_1'") as caught:
+        load_examples(detector, [one, two], tmp_path / "cues")
+    assert caught.value.code == "recordings_share_a_name"
+
+
+def drawn(height: int, width: int, *, seed: int = 0) -> Examples:
+    rng = np.random.default_rng(seed)
+    truth = np.zeros((2, height, width), np.uint8)
+    truth[:, 4:12, 8:20] = MOVING
+    geometric = rng.integers(0, 256, (2, len(GEOMETRIC_CUES), height // 4, width // 4), dtype=np.uint8)
+    return Examples(rng.integers(0, 256, (2, 3, height, width), dtype=np.uint8), geometric, truth)
+
+
+def test_a_batch_is_a_function_of_seed_and_step() -> None:
+    data = EvidenceData([drawn(64, 96), drawn(32, 64, seed=1)], SMALL)
+    assert len(data) == 4
+    first, again, other = data.sample(3), data.sample(3), data.sample(4)
+    for a, b in zip(first, again, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(first.photometric, other.photometric)
+    assert first.photometric.shape == (2, 3, 32, 64)
+    assert first.geometric.shape == (2, len(GEOMETRIC_CUES), 8, 16)
+    assert first.truth.shape == (2, 32, 64)
+    assert np.abs(first.photometric).max() <= 1.0
+
+
+def test_crops_of_small_images_are_filled_with_nothing() -> None:
+    wide = SMALL.model_copy(update={"crop_width": 128})
+    batch = EvidenceData([drawn(32, 64)], wide).sample(0)
+    filled = (batch.truth & IGNORED) != 0
+    assert filled.mean() == pytest.approx(0.5)
+    assert np.abs(batch.photometric.transpose(0, 2, 3, 1)[filled]).max() < 0.01
+
+
+def test_a_mirror_changes_the_side_of_what_lies_across() -> None:
+    examples = drawn(32, 64)
+    values = examples.geometric.copy()
+    values[:, ACROSS] = 255
+    data = EvidenceData([replace(examples, geometric=values)], SMALL)
+    seen = {float(crop[ACROSS].mean()) for step in range(20) for crop in data.sample(step).geometric}
+    assert seen == {1.0, -1.0}

@@ -1,0 +1,200 @@
+"""Training of the evidence head: it learns, it resumes exactly, its scores are fitted, its mistakes are told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from evidence_world import SMALL, recording
+from hypothesis import given
+from hypothesis import strategies as st
+
+from viflow_anomaly.checkpoint import load_evidence_head
+from viflow_anomaly.checkpoint_record import EvidenceRecord, read_tensors
+from viflow_anomaly.detector import AnomalyDetector
+from viflow_anomaly.errors import CheckpointError, ConfigError, DatasetError
+from viflow_anomaly.evidence_cues import GEOMETRIC_CUES
+from viflow_anomaly.evidence_data import IGNORED, MOVING, SEAM, EvidenceBatch
+from viflow_anomaly.evidence_run import train_evidence
+from viflow_anomaly.evidence_training import EvidenceTraining, evidence_loss
+from viflow_anomaly.moving_regions import REGION_FEATURES, probability_of
+from viflow_anomaly.region_score_fit import LabelledRegions, fit_region_score
+
+
+@pytest.fixture(scope="module")
+def detector() -> AnomalyDetector:
+    return AnomalyDetector.from_checkpoint(with_evidence=False)
+
+
+def batch(seed: int) -> EvidenceBatch:
+    """Movers are where the difference is large."""
+    rng = np.random.default_rng(seed)
+    truth = np.zeros((4, 32, 64), np.uint8)
+    photometric = rng.normal(0, 0.05, (4, 3, 32, 64)).astype(np.float32)
+    for one in range(4):
+        y, x = rng.integers(0, 16), rng.integers(0, 48)
+        truth[one, y : y + 12, x : x + 12] = MOVING
+        photometric[one, 0, y : y + 12, x : x + 12] = 0.8
+    return EvidenceBatch(photometric, np.zeros((4, len(GEOMETRIC_CUES), 8, 16), np.float32), truth)
+
+
+def test_it_learns_what_the_cues_show() -> None:
+    run = EvidenceTraining(SMALL.model_copy(update={"steps": 150}))
+    losses = [run.train_step(batch(step)) for step in range(150)]
+    assert np.mean(losses[-10:]) < 0.4 * np.mean(losses[:5])
+    new = batch(10_000)
+    run.network.eval()
+    with torch.inference_mode():
+        logits = run.network(torch.from_numpy(new.photometric), torch.from_numpy(new.geometric))[:, 0].numpy()
+    moving = new.truth == MOVING
+    assert (logits[moving] > 0).mean() > 0.75
+    assert (logits[~moving] < 0).mean() > 0.95
+
+
+def test_what_is_ignored_costs_nothing() -> None:
+    logits = torch.zeros(1, 2, 8, 8)
+    truth = torch.zeros(1, 8, 8, dtype=torch.uint8)
+    truth[0, :4] = MOVING
+    before = evidence_loss(logits, truth, motion_weight=3.0, seam_weight=0.3)
+    wrong, ignored = logits.clone(), truth.clone()
+    wrong[0, 0, 4:] = 9.0
+    ignored[0, 4:] = IGNORED
+    assert float(evidence_loss(wrong, truth, motion_weight=3.0, seam_weight=0.3)) > float(before) + 1
+    loss = evidence_loss(wrong, ignored, motion_weight=3.0, seam_weight=0.3)
+    assert float(loss) == pytest.approx(3.0 * np.log(2) + 0.5 * (1 - 33 / 49) + 0.3 * np.log(2), rel=1e-5)
+
+
+def test_seams_count_where_something_moves() -> None:
+    logits, truth = torch.zeros(1, 2, 8, 8), torch.zeros(1, 8, 8, dtype=torch.uint8)
+    truth[0, :4], truth[0, 3] = MOVING, MOVING | SEAM
+    logits[0, 1, 3], logits[0, 1, :3] = 9.0, -9.0
+    right = evidence_loss(logits, truth, motion_weight=1.0, seam_weight=1.0)
+    logits[0, 1, 4:] = 9.0  # where nothing moves a seam means nothing
+    assert float(evidence_loss(logits, truth, motion_weight=1.0, seam_weight=1.0)) == pytest.approx(float(right))
+    logits[0, 1, 3] = -9.0
+    assert float(evidence_loss(logits, truth, motion_weight=1.0, seam_weight=1.0)) > float(right) + 1
+
+
+def test_a_frame_without_movers_has_a_loss() -> None:
+    loss = evidence_loss(
+        torch.zeros(1, 2, 8, 8), torch.zeros(1, 8, 8, dtype=torch.uint8), motion_weight=3, seam_weight=1
+    )
+    assert bool(torch.isfinite(loss))
+
+
+def test_a_diverged_training_stops(tmp_path: Path) -> None:
+    run = EvidenceTraining(SMALL)
+    broken = batch(0)
+    broken.photometric[0, 0, 0, 0] = np.nan
+    with pytest.raises(ConfigError, match="finite loss") as caught:
+        run.train_step(broken)
+    assert caught.value.code == "training_diverged"
+
+
+class KilledError(Exception):
+    """The machine went down."""
+
+
+def test_a_killed_run_goes_on_to_the_same_weights(tmp_path: Path, detector: AnomalyDetector) -> None:
+    data, calibration = [recording(tmp_path / "drone_1")], [recording(tmp_path / "drone_2")]
+
+    def die(what: str, done: int, total: int) -> None:
+        if what.startswith("training") and done == 5:
+            raise KilledError
+
+    config = SMALL.model_copy(update={"steps": 8})
+    settings = {"calibration": calibration, "detector": easily_moved(detector), "training": config}
+    whole = train_evidence(data, tmp_path / "whole", **settings)  # type: ignore[arg-type]
+    with pytest.raises(KilledError):
+        train_evidence(data, tmp_path / "parts", report=die, **settings)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="--resume") as caught:
+        train_evidence(data, tmp_path / "parts", **settings)  # type: ignore[arg-type]
+    assert caught.value.code == "training_exists"
+    parts = train_evidence(data, tmp_path / "parts", resume=True, **settings)  # type: ignore[arg-type]
+    assert parts.read_bytes() == whole.read_bytes()
+    assert [one.name for one in (tmp_path / "whole" / "cues").iterdir()] == ["drone_1.npz"]
+    again = train_evidence(data, tmp_path / "parts", resume=True, **settings)  # type: ignore[arg-type]
+    assert again.read_bytes() == whole.read_bytes()
+    other = config.model_copy(update={"learning_rate": 1.0})
+    with pytest.raises(ConfigError) as differs:
+        train_evidence(data, tmp_path / "parts", resume=True, **{**settings, "training": other})  # type: ignore[arg-type]
+    assert differs.value.code == "resume_config_differs"
+    record = load_evidence_head(whole).record
+    assert record.provenance["model"]["sha256"] == detector.model_info.sha256
+    assert len(record.region_score.weights) == len(REGION_FEATURES)
+
+
+def easily_moved(detector: AnomalyDetector) -> AnomalyDetector:
+    """An untrained head says something near a half everywhere; some of it has to become regions."""
+    regions = detector.config.regions.model_copy(update={"min_motion_probability": 0.01})
+    return detector.with_config(detector.config.model_copy(update={"regions": regions}))
+
+
+def test_lists_must_not_overlap_or_be_empty(tmp_path: Path, detector: AnomalyDetector) -> None:
+    one = recording(tmp_path / "drone_1")
+    for data, calibration, code in (
+        ([one], [one], "calibration_trained_on"),
+        ([one], [], "config_invalid"),
+        ([], [one], "config_invalid"),
+    ):
+        with pytest.raises(ConfigError) as caught:
+            train_evidence(data, tmp_path / "out", calibration=calibration, detector=detector, training=SMALL)
+        assert caught.value.code == code
+    assert not (tmp_path / "out").exists()
+
+
+def test_scores_need_regions(tmp_path: Path, detector: AnomalyDetector) -> None:
+    regions = detector.config.regions.model_copy(update={"min_motion_probability": 0.99})
+    never = detector.with_config(detector.config.model_copy(update={"regions": regions}))
+    data, calibration = [recording(tmp_path / "drone_1")], [recording(tmp_path / "drone_2")]
+    with pytest.raises(DatasetError, match="regions that count"):
+        train_evidence(data, tmp_path / "out", calibration=calibration, detector=never, training=SMALL)
+
+
+def test_a_damaged_state_is_told(tmp_path: Path) -> None:
+    run = EvidenceTraining(SMALL)
+    run.train_step(batch(0))
+    run.save(tmp_path, {})
+    other = EvidenceTraining(SMALL.model_copy(update={"head": SMALL.head.model_copy(update={"widths": (8, 8, 8, 16)})}))
+    with pytest.raises(CheckpointError) as caught:
+        other.restore(tmp_path, {})
+    assert caught.value.code == "checkpoint_corrupt"
+
+
+def test_a_head_is_not_a_network_and_says_so(tmp_path: Path) -> None:
+    bundled = Path(__file__).parent.parent / "viflow_anomaly" / "weights" / "viflow-calibrated.safetensors"
+    with pytest.raises(CheckpointError, match="head") as caught:
+        read_tensors(bundled, EvidenceRecord)
+    assert caught.value.code == "checkpoint_record_invalid"
+
+
+# --- scores
+
+
+def regions_with_truth(count: int, seed: int) -> tuple[LabelledRegions, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    features = rng.normal(size=(count, len(REGION_FEATURES)))
+    logits = 1.5 * features[:, 0] - 1.0 * features[:, 10] + 0.3
+    return LabelledRegions(features, rng.random(count) < 1 / (1 + np.exp(-logits))), logits
+
+
+def test_fitted_scores_are_probabilities() -> None:
+    fitted = fit_region_score(regions_with_truth(4000, seed=0)[0])
+    new, logits = regions_with_truth(4000, seed=1)
+    scores = np.array([probability_of(features, fitted) for features in new.features])
+    assert np.abs(scores - 1 / (1 + np.exp(-logits))).mean() < 0.03
+    bins = np.minimum((scores * 5).astype(int), 4)
+    for k in range(5):
+        chosen = bins == k
+        assert abs(scores[chosen].mean() - new.moving[chosen].mean()) < 0.06
+
+
+@given(st.integers(1, 30), st.booleans())
+def test_few_regions_of_one_kind_give_a_finite_score(count: int, moving: bool) -> None:
+    features = np.random.default_rng(count).normal(size=(count, len(REGION_FEATURES)))
+    fitted = fit_region_score(LabelledRegions(features, np.full(count, moving)))
+    for one in features:
+        score = probability_of(one, fitted)
+        assert score > 0.5 if moving else score < 0.5
