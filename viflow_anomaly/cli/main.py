@@ -16,6 +16,7 @@ from typer.exceptions import TyperException
 
 from viflow_anomaly.cli import (
     batch,
+    calibrate,
     configuration,
     detect,
     evaluate,
@@ -39,7 +40,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="Exit codes: 0 done, 2 bad usage or input, 3 some pairs failed, 130 interrupted.",
 )
-for module in (detect, batch, simulate, train, groundtruth, evaluate, export, serve, schema, configuration):
+for module in (detect, batch, calibrate, simulate, train, groundtruth, evaluate, export, serve, schema, configuration):
     module.register(app)
 
 
