@@ -43,19 +43,22 @@ def load_bundled_or_configured(settings: ServiceSettings) -> PairDetector:
 
     Raises:
         CheckpointError: the checkpoint cannot be used.
+        ConfigError: the calibration cannot be read, or was made with something else.
     """
     import cv2  # noqa: PLC0415 - heavy, and needed only once a server really starts
 
+    from viflow_anomaly.alarm_calibration import calibrated  # noqa: PLC0415
     from viflow_anomaly.detector import AnomalyDetector  # noqa: PLC0415
 
     cv2.setNumThreads(settings.threads)
-    return AnomalyDetector.from_checkpoint(
+    detector = AnomalyDetector.from_checkpoint(
         settings.checkpoint,
         config=settings.detector,
         device=settings.device,
         runtime=settings.runtime,
         threads=settings.threads,
     )
+    return calibrated(detector, settings.calibration)
 
 
 def create_app(

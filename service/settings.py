@@ -31,6 +31,7 @@ class ServiceSettings(BaseSettings):
     )
 
     checkpoint: UsablePath | None = Field(default=None, description="model to load; the bundled one when not given")
+    calibration: UsablePath | None = Field(default=None, description="file of `viflow-anomaly calibrate`")
     device: str = "cpu"
     runtime: RuntimeName = Field(default="auto", description="torch, openvino, or auto: OpenVINO where it can run")
     detector: DetectorConfig = DetectorConfig()

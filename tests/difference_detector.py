@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +37,9 @@ class DifferenceDetector:
     on_pair: Callable[[FramePair], None] = lambda pair: None
     seen: list[int] = field(default_factory=list)
     motor_source: MotorSource | None = None
+
+    def with_config(self, config: DetectorConfig) -> DifferenceDetector:
+        return replace(self, config=config)
 
     def detect(self, pair: FramePair, *, decode_ms: float = 0.0) -> Detection:
         return self.analyze(pair, decode_ms=decode_ms).detection

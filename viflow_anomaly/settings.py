@@ -60,11 +60,13 @@ class Settings(FrozenConfig):
     """All that the command line can be told; each command uses its own sections.
 
     ``threads`` defaults to 1: one pair at a time is fastest that way wherever anything else runs on the machine,
-    because idle OpenMP threads of a wider pool spin and take the cores from each other.
+    because idle OpenMP threads of a wider pool spin and take the cores from each other. ``calibration`` is a file of
+    ``viflow-anomaly calibrate``; its threshold takes the place of ``detector.regions.motion_score``.
     """
 
     checkpoint: UsablePath | None = None
     evidence_head: UsablePath | None = None
+    calibration: UsablePath | None = None
     device: str = "cpu"
     threads: int = Field(default=1, ge=1, le=MAX_THREADS)
     runtime: RuntimeName = "auto"

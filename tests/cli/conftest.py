@@ -6,6 +6,7 @@ import pytest
 from difference_detector import DifferenceDetector
 from pair_world import Ask, PairFolder, answer_to, write_pair_folder
 
+from viflow_anomaly.alarm_calibration import calibrated
 from viflow_anomaly.settings import Settings
 
 
@@ -19,8 +20,8 @@ def ask(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> 
     """Run a command line in this process with a detector that needs no network."""
 
     def load(settings: Settings) -> DifferenceDetector:
-        return DifferenceDetector(config=settings.detector)
+        return calibrated(DifferenceDetector(config=settings.detector), settings.calibration)
 
-    for command in ("detect", "batch"):
+    for command in ("detect", "batch", "calibrate"):
         monkeypatch.setattr(f"viflow_anomaly.cli.{command}.load_detector", load)
     return lambda arguments: answer_to(arguments, capsys)

@@ -17,7 +17,7 @@ from viflow_anomaly.cli.progress import stderr_progress
 from viflow_anomaly.detection import load_detection_schema
 from viflow_anomaly.errors import CheckpointError
 
-COMMANDS = ("detect", "batch", "simulate", "train", "serve", "schema", "config")
+COMMANDS = ("detect", "batch", "calibrate", "simulate", "train", "serve", "schema", "config")
 HEAVY = {"torch", "cv2", "skimage", "mujoco", "fastapi"}
 
 
@@ -240,6 +240,13 @@ def test_serve_hands_the_runtime_over(ask: Ask, monkeypatch: pytest.MonkeyPatch)
     stand_in(monkeypatch, "viflow_anomaly_service.server", run=asked.append)
     assert ask(["serve", "--set", "runtime=torch"]).code == 0
     assert asked[0].runtime == "torch"
+
+
+def test_serve_hands_the_calibration_over(ask: Ask, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    stand_in(monkeypatch, "viflow_anomaly_service.server", run=asked.append)
+    assert ask(["serve", "--calibration", "hall.json"]).code == 0
+    assert asked[0].calibration == Path("hall.json")
 
 
 def test_serve_refuses_bad_settings(ask: Ask, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,12 +21,16 @@ import numpy as np
 import pytest
 from service_world import INTERVAL_NS, T0, LiveServer, assert_problem, base64_text, imu_part, live_server, png
 
+from viflow_anomaly.alarm_calibration import make_calibration, write_calibration
+from viflow_anomaly.alarm_footage import JudgedPair, WatchedRecording, footage_of
 from viflow_anomaly.datasets.camera_json import camera_from_mapping
 from viflow_anomaly.detection import load_detection_schema, to_json_dict
 from viflow_anomaly.detector import AnomalyDetector
+from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples
 from viflow_anomaly_service.app import load_bundled_or_configured
 from viflow_anomaly_service.examples import example_json_request
+from viflow_anomaly_service.settings import load_settings
 
 ROOT = Path(__file__).parents[2]
 WIDTH, HEIGHT = 240, 160
@@ -217,6 +221,28 @@ def test_a_checkpoint_that_cannot_be_used_ends_the_process(tmp_path: Path, conte
     )
     assert ended.returncode == 2, ended.stderr
     assert str(checkpoint) in ended.stderr.splitlines()[-1]
+
+
+def test_a_calibration_decides_what_is_labelled_as_motion(tmp_path: Path) -> None:
+    detector = AnomalyDetector.from_checkpoint()
+    loud = JudgedPair(0.05, (0.9999,))
+    watched = [WatchedRecording("hall", None, (loud,), abstained=0, failed={})]
+    calibration = make_calibration(
+        watched,
+        footage_of(watched),
+        model=detector.model_info,
+        detector=detector.config,
+        budget_per_hour=1.0,
+        confidence=0.9,
+        block_s=10.0,
+    )
+    write_calibration(tmp_path / "hall.json", calibration)
+    loaded = load_bundled_or_configured(load_settings(calibration=tmp_path / "hall.json"))
+    assert loaded.config.regions.motion_score == calibration.motion_score == 1.0
+    other = load_settings(calibration=tmp_path / "hall.json", detector={"min_overlap": 0.2})
+    with pytest.raises(ConfigError, match=r"detector.min_overlap 0.05, found 0.2") as caught:
+        load_bundled_or_configured(other)
+    assert caught.value.code == "calibration_stale"
 
 
 def test_the_printed_curl_lines_work(server: LiveServer) -> None:

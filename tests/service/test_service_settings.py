@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from viflow_anomaly.errors import ConfigError
@@ -45,6 +47,12 @@ def test_a_wrong_variable_is_named(monkeypatch: pytest.MonkeyPatch, name: str, v
     with pytest.raises(ConfigError) as caught:
         load_settings()
     assert (caught.value.code, caught.value.field) == ("config_invalid", place)
+
+
+def test_a_calibration_is_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert load_settings().calibration is None
+    monkeypatch.setenv("VIFLOW_CALIBRATION", "hall.json")
+    assert load_settings().calibration == Path("hall.json")
 
 
 def test_the_library_knows_the_names_that_only_the_service_takes() -> None:

@@ -12,6 +12,7 @@ import typer
 from viflow_anomaly.cli.options import (
     AsJson,
     Assignments,
+    Calibration,
     Checkpoint,
     ConfigFile,
     Device,
@@ -61,6 +62,7 @@ def batch(
     masks: Annotated[bool | None, typer.Option("--masks", help="Add each region's mask (COCO RLE).")] = None,
     as_json: AsJson = False,
     checkpoint: Checkpoint = None,
+    calibration: Calibration = None,
     threads: Threads = None,
     device: Device = None,
     config: ConfigFile = None,
@@ -80,8 +82,8 @@ def batch(
     """
     if resume and overwrite:
         raise typer.BadParameter("--resume keeps what --overwrite would replace; give one of them")
-    options = {"checkpoint": checkpoint, "threads": threads, "device": device, "detector.include_masks": masks}
-    settings = settings_from(config, assignments, options)
+    options = {"checkpoint": checkpoint, "calibration": calibration, "threads": threads, "device": device}
+    settings = settings_from(config, assignments, {**options, "detector.include_masks": masks})
     from viflow_anomaly.batch_job import BatchOptions
     from viflow_anomaly.datasets.registry import open_recording
 
@@ -96,11 +98,34 @@ def batch(
         resume=resume,
         overwrite=overwrite,
     )
+    _require_successive_frames(settings.calibration, look_ahead)
     detector = load_detector(settings)
     recorded = settings.model_dump(mode="json", include={"checkpoint", "device", "threads", "limits"})
+    recorded["calibration"] = _recorded_calibration(settings.calibration)
     summary = _run(recording, detector, batch_options, recorded)
     _report(summary, as_json=as_json)
     return EXIT_SOME_FAILED if summary.failures else 0
+
+
+def _require_successive_frames(calibration: Path | None, look_ahead: int) -> None:
+    """Pairs further apart have other scores than those that a calibration is made of.
+
+    Raises:
+        ConfigError: ``calibration_stale``.
+    """
+    if calibration is not None and look_ahead != 1:
+        from viflow_anomaly.alarm_calibration import stale
+
+        raise stale(calibration, "pairs of successive frames (look-ahead 1)", f"look-ahead {look_ahead}")
+
+
+def _recorded_calibration(path: Path | None) -> dict[str, Any] | None:
+    """For ``run.json``: the whole file, and where it lay."""
+    if path is None:
+        return None
+    from viflow_anomaly.alarm_calibration import read_calibration
+
+    return {"path": str(path), **read_calibration(path).model_dump(mode="json")}
 
 
 def default_out_dir(directory: Path) -> Path:

@@ -10,6 +10,7 @@ import typer
 from viflow_anomaly.cli.options import (
     AsJson,
     Assignments,
+    Calibration,
     Checkpoint,
     ConfigFile,
     Device,
@@ -41,6 +42,7 @@ def detect(
     masks: Annotated[bool | None, typer.Option("--masks", help="Add each region's mask (COCO RLE).")] = None,
     as_json: AsJson = False,
     checkpoint: Checkpoint = None,
+    calibration: Calibration = None,
     threads: Threads = None,
     device: Device = None,
     config: ConfigFile = None,
@@ -55,8 +57,8 @@ def detect(
       viflow-anomaly detect frame0.png frame1.png --imu imu.csv --json --overlay out.png
       --source-timestamp-ns 1403715273262142976 --target-timestamp-ns 1403715273312143104
     """
-    options = {"checkpoint": checkpoint, "threads": threads, "device": device, "detector.include_masks": masks}
-    settings = settings_from(config, assignments, options)
+    options = {"checkpoint": checkpoint, "calibration": calibration, "threads": threads, "device": device}
+    settings = settings_from(config, assignments, {**options, "detector.include_masks": masks})
     from viflow_anomaly.cli.pair_files import PairFiles, load_pair
     from viflow_anomaly.detection import to_json
     from viflow_anomaly.motor_input import require_supported

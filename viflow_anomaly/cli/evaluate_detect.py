@@ -11,6 +11,7 @@ import typer
 from viflow_anomaly.cli.options import (
     AsJson,
     Assignments,
+    Calibration,
     Checkpoint,
     ConfigFile,
     Device,
@@ -43,6 +44,7 @@ def detect(
         typer.Option(metavar="DIR", help="Draw charts into this folder (PNG and PDF; needs the extra 'plots')."),
     ] = None,
     checkpoint: Checkpoint = None,
+    calibration: Calibration = None,
     threads: Threads = None,
     device: Device = None,
     config: ConfigFile = None,
@@ -60,7 +62,8 @@ def detect(
 
       viflow-anomaly evaluate detect runs/held-out/* --no-rivals --set detector.correction.enabled=false --json
     """
-    settings = settings_from(config, assignments, {"checkpoint": checkpoint, "threads": threads, "device": device})
+    options = {"checkpoint": checkpoint, "calibration": calibration, "threads": threads, "device": device}
+    settings = settings_from(config, assignments, options)
     from viflow_anomaly.evaluation.detection_methods import OURS, DetectorMethod, rival_methods
     from viflow_anomaly.evaluation.detection_quality import measure_detection
     from viflow_anomaly.evaluation.detection_report import detection_report

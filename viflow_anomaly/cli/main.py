@@ -16,6 +16,7 @@ from typer.exceptions import TyperException
 
 from viflow_anomaly.cli import (
     batch,
+    calibrate,
     configuration,
     detect,
     evaluate,
@@ -43,6 +44,7 @@ app = typer.Typer(
 for module in (
     detect,
     batch,
+    calibrate,
     simulate,
     train,
     train_evidence,

@@ -23,6 +23,12 @@ Assignments = Annotated[
 Checkpoint = Annotated[
     Path | None, typer.Option(metavar="PATH", help="Weights to use instead of the bundled model.", show_default=False)
 ]
+Calibration = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="Threshold of a false-alarm budget, as `calibrate` wrote it.", show_default=False
+    ),
+]
 Threads = Annotated[
     int | None,
     typer.Option(
@@ -51,13 +57,15 @@ def load_detector(settings: Settings, *, evidence: bool = True) -> AnomalyDetect
 
     Raises:
         CheckpointError: a checkpoint that cannot be used.
+        ConfigError: as ``alarm_calibration.calibrated``.
     """
     import cv2
 
+    from viflow_anomaly.alarm_calibration import calibrated
     from viflow_anomaly.detector import AnomalyDetector
 
     cv2.setNumThreads(settings.threads)
-    return AnomalyDetector.from_checkpoint(
+    detector = AnomalyDetector.from_checkpoint(
         settings.checkpoint,
         config=settings.detector,
         device=settings.device,
@@ -66,3 +74,4 @@ def load_detector(settings: Settings, *, evidence: bool = True) -> AnomalyDetect
         evidence_head=settings.evidence_head,
         with_evidence=evidence,
     )
+    return calibrated(detector, settings.calibration)

@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from viflow_anomaly.cli.options import Assignments, Checkpoint, ConfigFile, Device, Threads, settings_from
+from viflow_anomaly.cli.options import (
+    Assignments,
+    Calibration,
+    Checkpoint,
+    ConfigFile,
+    Device,
+    Threads,
+    settings_from,
+)
 from viflow_anomaly.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -18,6 +26,7 @@ def serve(
     host: Annotated[str | None, typer.Option(help="Address to listen on (default 127.0.0.1).")] = None,
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port (default 8000; 0 takes a free one).")] = None,
     checkpoint: Checkpoint = None,
+    calibration: Calibration = None,
     threads: Threads = None,
     device: Device = None,
     config: ConfigFile = None,
@@ -31,7 +40,8 @@ def serve(
 
       viflow-anomaly serve --host 0.0.0.0 --port 8000
     """
-    settings = settings_from(config, assignments, {"checkpoint": checkpoint, "threads": threads, "device": device})
+    options = {"checkpoint": checkpoint, "calibration": calibration, "threads": threads, "device": device}
+    settings = settings_from(config, assignments, options)
     _refuse_other_limits(settings.limits)
     # By name: the service is built on the library, so no module of the library may import it.
     service_settings = import_module("viflow_anomaly_service.settings")
@@ -41,6 +51,7 @@ def serve(
             host=host,
             port=port,
             checkpoint=settings.checkpoint,
+            calibration=settings.calibration,
             threads=settings.threads,
             device=settings.device,
             runtime=settings.runtime,
