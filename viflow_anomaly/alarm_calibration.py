@@ -214,11 +214,13 @@ def require_current(calibration: AlarmCalibration, detector: Detector, *, where:
     """
     made_with = {
         "model.sha256": calibration.model.sha256,
+        "model.version": calibration.model.version,
         **flattened("detector", calibration.detector),
         "viflow-anomaly": calibration.package_version,
     }
     now = {
         "model.sha256": detector.model_info.sha256,
+        "model.version": detector.model_info.version,
         **flattened("detector", what_scores_depend_on(detector.config)),
         "viflow-anomaly": version("viflow-anomaly"),
     }

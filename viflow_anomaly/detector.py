@@ -111,6 +111,8 @@ class JudgedCues(NamedTuple):
 class AnomalyDetector:
     """Finds independent motion. Holds weights and configuration only, so that threads may share it.
 
+    ``model_info`` is the network's; an evidence head that takes part is told behind the version's plus.
+
     Args:
         runtime: of the network.
         record: where the network came from and what its input looks like.
@@ -139,7 +141,10 @@ class AnomalyDetector:
         self._record = record
         self._evidence = evidence
         self.config = config
-        self.model_info = ModelInfo(name=record.name, version=record.version, sha256=record.sha256)
+        version = record.version
+        if evidence is not None and config.evidence != "residual":
+            version += f"+{evidence.record.name}.{evidence.record.sha256[:12]}"
+        self.model_info = ModelInfo(name=record.name, version=version, sha256=record.sha256)
 
     @classmethod
     def from_checkpoint(
