@@ -24,6 +24,7 @@ from viflow_anomaly.config import (
     FrozenConfig,
     ImageLimits,
     ModelConfig,
+    RigEstimateConfig,
     RuntimeName,
     TrackingConfig,
     TrainingConfig,
@@ -69,6 +70,7 @@ class Settings(FrozenConfig):
     limits: ImageLimits = ImageLimits()
     detector: DetectorConfig = DetectorConfig()
     tracking: TrackingConfig = TrackingConfig()
+    rig_estimate: RigEstimateConfig = RigEstimateConfig()
     model: ModelConfig = ModelConfig()
     training: TrainingConfig = TrainingConfig()
     simulator: SimulatorConfig = Field(default_factory=lambda: SimulatorConfig.model_validate({}))
