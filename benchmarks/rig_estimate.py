@@ -3,9 +3,8 @@
 Each recording is judged as it is and with errors put into it (5 and 20 ms of clock offset either way, a degree of
 mounting), once with the estimate only reported and once with it applied. A row says, in the mean over a group of
 recordings (the name up to its first underscore): how far the estimates are from the truth and from their own sigmas,
-where the truth is known (simulated sequences; the offset and mounting that were put in are taken for the truth of other
-recordings only in the difference to the run without), the photometric residual, and the flow's endpoint error where it
-can be measured.
+where the truth is known (simulated sequences; of other recordings the estimates are listed as they are), the photometric
+residual, and the flow's endpoint error where it can be measured.
 
     python benchmarks/rig_estimate.py SEQUENCE... --out benchmarks/results/rig-estimate.json
 """
@@ -51,7 +50,6 @@ class Outcome(NamedTuple):
     Attributes:
         estimate: after its last pair.
         truth: [7], None where the bias is not known.
-        put_in: [7] the errors put in.
         applied_pairs: that something was applied to.
         residual_gray: mean over pairs.
         endpoint_error_px: mean over pairs, None without ground truth.
@@ -59,7 +57,6 @@ class Outcome(NamedTuple):
 
     estimate: RigEstimate
     truth: Float64Array | None
-    put_in: Float64Array
     applied_pairs: int
     residual_gray: float
     endpoint_error_px: float | None
@@ -99,7 +96,6 @@ def judge(detector: AnomalyDetector, path: Path, put_in: Float64Array, config: R
     return Outcome(
         estimate=estimate,
         truth=None if bias is None else put_in + np.concatenate([bias, np.zeros(UNKNOWNS - 3)]),
-        put_in=put_in,
         applied_pairs=applied_pairs,
         residual_gray=float(np.mean(residuals)),
         endpoint_error_px=float(np.mean(errors)) if errors else None,

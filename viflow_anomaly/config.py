@@ -338,10 +338,10 @@ class RigEstimateConfig(FrozenConfig):
     gate_sigmas: float = Field(default=4.0, gt=0, le=100, description="beyond it a pair is an outlier")
     reopen_after: PositiveInt = Field(default=20, description="outliers in a row after which the prior is back")
     apply_bias_sigma_rad_s: float = Field(
-        default=0.01, gt=0, le=10, description="a bias known this well may be applied"
+        default=0.005, gt=0, le=10, description="a bias whose deviations are below it may be applied"
     )
-    apply_offset_sigma_s: float = Field(default=0.003, gt=0, le=1)
-    apply_mounting_sigma_rad: float = Field(default=0.005, gt=0, le=1)
+    apply_offset_sigma_s: float = Field(default=0.003, gt=0, le=1, description="likewise")
+    apply_mounting_sigma_rad: float = Field(default=0.002, gt=0, le=1, description="likewise")
 
 
 def loss_of_preset(preset: str) -> str:
