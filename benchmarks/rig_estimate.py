@@ -1,10 +1,10 @@
 """How well gyro bias, time offset and mounting are estimated over a stream, and whether applying them pays.
 
 Each recording is judged as it is and with errors put into it (5 and 20 ms of clock offset either way, a degree of
-mounting), once with the estimate only reported and once with it applied. A row says, in the mean over a group of
-recordings (the name up to its first underscore): how far the estimates are from the truth and from their own sigmas,
-where the truth is known (simulated sequences; of other recordings the estimates are listed as they are), the photometric
-residual, and the flow's endpoint error where it can be measured.
+mounting), once with the estimate only reported and once with it applied. A row says over a group of recordings (of
+simulated ones the name up to its first underscore) how far the estimates are from the truth and in their own sigmas,
+where the truth is known (else the estimates themselves), the photometric residual, and the flow's endpoint error where
+it can be measured.
 
     python benchmarks/rig_estimate.py SEQUENCE... --out benchmarks/results/rig-estimate.json
 """
