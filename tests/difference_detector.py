@@ -19,6 +19,7 @@ from viflow_anomaly.detection import (
     rois_from_regions,
 )
 from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.prediction import PredictedFlow
 from viflow_anomaly.regions import find_regions
 from viflow_anomaly.sensor_data import FramePair
 
@@ -26,6 +27,7 @@ from viflow_anomaly.sensor_data import FramePair
 class DifferenceAnalysis(NamedTuple):
     detection: Detection
     residual: Float32Array
+    predicted: PredictedFlow | None = None
 
 
 @dataclass

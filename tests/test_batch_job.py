@@ -18,7 +18,7 @@ from viflow_anomaly import batch_files, batch_record
 from viflow_anomaly.batch_files import Journal
 from viflow_anomaly.batch_job import BatchOptions, run_batch
 from viflow_anomaly.batch_pictures import spread_indices
-from viflow_anomaly.config import DetectorConfig, RegionConfig, TrackingConfig
+from viflow_anomaly.config import DetectorConfig, RegionConfig, RigEstimateConfig, TrackingConfig
 from viflow_anomaly.datasets.recording import FileRecording
 from viflow_anomaly.detection import ModelInfo, load_detection_schema
 from viflow_anomaly.errors import DatasetError, InvalidInputError, ViflowError
@@ -99,7 +99,15 @@ def test_run_json_records_what_decided_the_results(recording: FileRecording, out
     assert run["state"] == "done"
     assert run["counts"] == {"pairs": 3, "ok": 3, "abstained": 0, "failed": 0}
     tracking = TrackingConfig().model_dump(mode="json")
-    assert run["options"] == {"look_ahead": 2, "limit": 3, "overlays": 0, "video": False, "tracking": tracking}
+    assert run["options"] == {
+        "look_ahead": 2,
+        "limit": 3,
+        "overlays": 0,
+        "video": False,
+        "tracking": tracking,
+        "rig_estimate": RigEstimateConfig().model_dump(mode="json"),
+    }
+    assert run["rig_estimate"] is None
     assert run["configuration"] == {"threads": 1, "detector": DetectorConfig().model_dump(mode="json")}
     assert run["model"] == {"name": "difference", "version": "1", "sha256": "ab" * 32}
     assert run["recording"]["frames"] == FRAMES

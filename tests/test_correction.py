@@ -74,6 +74,27 @@ def test_a_motion_within_the_priors_reach_is_found() -> None:
     assert abs(corrected.turned_rad - np.linalg.norm((0.002, -0.001, 0.001))) < 2e-4
 
 
+def test_the_measured_turn_is_the_images_word_without_the_prior() -> None:
+    """However hard the prior pulls the correction back to the gyro's rotation."""
+    seen, off = sight(), np.array((0.004, -0.003, 0.002))
+    start = RigidMotion(so3_exp(-off) @ seen.true.rotation, seen.true.translation)
+    for sigma_rad in (1e-2, 1e-4):
+        config = CorrectionConfig(rounds=10, rotation_sigma_rad=sigma_rad)
+        turn = correct_motion(RAYS, seen.inverse_depth, start, seen.measured, FOCAL_PX, config).turn
+        assert turn is not None
+        np.testing.assert_allclose(turn.turned_rad, off, atol=3e-4)
+        assert np.linalg.eigvalsh(turn.covariance_rad2).min() > 0
+        assert np.sqrt(np.diag(turn.covariance_rad2)).max() < 5e-3
+
+
+def test_no_turn_is_told_where_nothing_converged_or_no_motion_is_known() -> None:
+    seen = sight()
+    nothing = seen.measured._replace(confidence=np.zeros((ROWS, COLUMNS), np.float32))
+    assert correct_motion(RAYS, seen.inverse_depth, still(), nothing, FOCAL_PX, CorrectionConfig()).turn is None
+    flows = np.stack([seen.measured.flow_px, 0.9 * seen.measured.flow_px])
+    assert correct_flow(RAYS, flows, 1, seen.measured, FOCAL_PX, CorrectionConfig()).turn is None
+
+
 def test_the_true_start_stays() -> None:
     seen = sight()
     corrected = correct_motion(RAYS, seen.inverse_depth, seen.true, seen.measured, FOCAL_PX, CorrectionConfig())

@@ -5,6 +5,7 @@
     OUT/detections.jsonl          one ROI JSON object a line, in time order; appears whole or not at all
     OUT/detections.jsonl.partial  the journal of a run that has not ended; a line for each pair that is done
     OUT/run.json                  configuration, model, versions, counts, failures ("state": running or done)
+    OUT/rig_estimate.jsonl        what each pair said of the IMU and its mounting; see batch_rig.py
     OUT/overlays/<source_ns>.png  on request
     OUT/overlay.mp4               on request; its frames wait in OUT/overlay.mp4.partial/
 """
@@ -28,6 +29,7 @@ from viflow_anomaly.errors import InvalidInputError
 DETECTIONS_NAME = "detections.jsonl"
 JOURNAL_NAME = "detections.jsonl.partial"
 RUN_NAME = "run.json"
+RIG_NAME = "rig_estimate.jsonl"
 OVERLAYS_NAME = "overlays"
 VIDEO_NAME = "overlay.mp4"
 VIDEO_FRAMES_NAME = "overlay.mp4.partial"
@@ -186,7 +188,7 @@ def read_run(out_dir: Path) -> dict[str, Any] | None:
 
 def clear_results(out_dir: Path) -> None:
     """Remove what a batch run writes (its journal aside), and nothing else that may lie there."""
-    for name in (DETECTIONS_NAME, RUN_NAME, VIDEO_NAME):
+    for name in (DETECTIONS_NAME, RUN_NAME, RIG_NAME, VIDEO_NAME):
         (out_dir / name).unlink(missing_ok=True)
     for name, pattern in ((OVERLAYS_NAME, "*.png"), (VIDEO_FRAMES_NAME, "*.png")):
         folder = out_dir / name

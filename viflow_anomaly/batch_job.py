@@ -9,17 +9,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol, Self
 
 from pydantic import Field, NonNegativeInt, PositiveInt
 
 from viflow_anomaly.batch_files import (
     DETECTIONS_NAME,
     JOURNAL_NAME,
+    RIG_NAME,
     RUN_NAME,
     Journal,
+    Stamps,
     clear_results,
     read_run,
     reopen_results,
@@ -34,13 +37,15 @@ from viflow_anomaly.batch_record import (
     describe_run,
     summarise,
 )
+from viflow_anomaly.batch_rig import RigJournal
 from viflow_anomaly.batch_tracking import tracked_lines
-from viflow_anomaly.config import DetectorConfig, FrozenConfig, MotorSource, TrackingConfig
+from viflow_anomaly.config import DetectorConfig, FrozenConfig, MotorSource, RigEstimateConfig, TrackingConfig
 from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.datasets.recording import Recording
 from viflow_anomaly.detection import Detection, ModelInfo, to_json
 from viflow_anomaly.detection_reading import detection_from_json
 from viflow_anomaly.errors import DatasetError, InvalidInputError, ViflowError
+from viflow_anomaly.rig_estimate import RigEstimate, corrected_pair, observe, update
 from viflow_anomaly.sensor_data import FramePair
 from viflow_anomaly.tracking import Tracker, TrackingState
 
@@ -49,7 +54,7 @@ class BatchOptions(FrozenConfig):
     """Where a batch run writes, which pairs it takes and what it draws.
 
     ``overlays``: how many pictures, spread evenly over the run, or ``"all"``. ``tracking``: how regions become tracks;
-    None: they do not, ``track_id`` stays null.
+    None: they do not, ``track_id`` stays null. ``rig_estimate``: what the run learns of the IMU and its mounting.
     """
 
     out_dir: Path
@@ -58,6 +63,7 @@ class BatchOptions(FrozenConfig):
     overlays: NonNegativeInt | Literal["all"] = 0
     video: bool = False
     tracking: TrackingConfig | None = TrackingConfig()
+    rig_estimate: RigEstimateConfig = RigEstimateConfig()
     resume: bool = False
     overwrite: bool = False
 
@@ -73,8 +79,6 @@ class PairDetector(Protocol):
 
     @property
     def motor_source(self) -> MotorSource | None: ...
-
-    def detect(self, pair: FramePair, *, decode_ms: float = 0.0) -> Detection: ...
 
     def analyze(self, pair: FramePair, *, decode_ms: float = 0.0) -> PairAnalysis: ...
 
@@ -121,58 +125,90 @@ def run_batch(
     with Journal(options.out_dir / JOURNAL_NAME) as journal:
         _start(options, journal, pairs)
         write_json(options.out_dir / RUN_NAME, {"state": "running", **run})
-        reused = len(journal.lines)
-        complete = all(pairs.stamps(index) in journal.lines for index in range(count))
-        pictures = Pictures(options.out_dir, count, overlays=options.overlays, video=options.video, complete=complete)
-        tracker = Tracker(options.tracking) if options.tracking else None
-        failures, state = [], TrackingState()
+        job = _Job.of(pairs, count, detector, options, journal)
+        reused = sum(not job.rig.lacks(stamps) for stamps in journal.lines)
+        failures, state = [], _State(TrackingState(), RigEstimate.prior(options.rig_estimate))
         for index in range(count):
-            failure, state = _judge(pairs, index, detector, journal, pictures, tracker, state)
+            failure, state = _judge(job, index, state)
             failures += [failure] if failure else []
             if on_progress:
                 on_progress(index + 1, count, len(failures))
-        journal.publish(options.out_dir / DETECTIONS_NAME, partial(tracked_lines, tracker=tracker))
-        pictures.finish([pairs.stamps(index)[0] for index in range(count)])
+        journal.publish(options.out_dir / DETECTIONS_NAME, partial(tracked_lines, tracker=job.tracker))
+        job.pictures.finish([pairs.stamps(index)[0] for index in range(count)])
         wall_time_s = time.monotonic() - started
         summary = summarise(options.out_dir, journal.lines, failures, reused=reused, wall_time_s=wall_time_s)
-        write_json(options.out_dir / RUN_NAME, {"state": "done", **run, **describe_outcome(summary)})
+        rig = state.rig.report(options.rig_estimate) if job.rig.observations else None
+        outcome = {**describe_outcome(summary), "rig_estimate": rig}
+        write_json(options.out_dir / RUN_NAME, {"state": "done", **run, **outcome})
     return summary
 
 
-def _judge(
-    pairs: RecordingPairs,
-    index: int,
-    detector: PairDetector,
-    journal: Journal,
-    pictures: Pictures,
-    tracker: Tracker | None,
-    state: TrackingState,
-) -> tuple[PairFailure | None, TrackingState]:
-    """Detect, draw and write down one pair, or say why that cannot be done.
+class _State(NamedTuple):
+    """After a pair. ``tracking`` is what pictures show; the journal is tracked as a whole when the run ends."""
 
-    ``state``, before and after the pair, is what pictures show; the journal is tracked as a whole when the run ends.
-    """
-    stamps = pairs.stamps(index)
+    tracking: TrackingState
+    rig: RigEstimate
+
+
+@dataclass(frozen=True)
+class _Job:
+    """The parts of one run."""
+
+    pairs: RecordingPairs
+    detector: PairDetector
+    journal: Journal
+    rig: RigJournal
+    pictures: Pictures
+    tracker: Tracker | None
+    rig_config: RigEstimateConfig
+
+    @classmethod
+    def of(
+        cls, pairs: RecordingPairs, count: int, detector: PairDetector, options: BatchOptions, journal: Journal
+    ) -> Self:
+        rig = RigJournal(options.out_dir / RIG_NAME)
+        stamps = map(pairs.stamps, range(count))
+        complete = all(one in journal.lines and not rig.lacks(one) for one in stamps)
+        pictures = Pictures(options.out_dir, count, overlays=options.overlays, video=options.video, complete=complete)
+        tracker = Tracker(options.tracking) if options.tracking else None
+        return cls(pairs, detector, journal, rig, pictures, tracker, options.rig_estimate)
+
+    def is_done(self, stamps: Stamps) -> bool:
+        return stamps in self.journal.lines and not self.rig.lacks(stamps)
+
+
+def _judge(job: _Job, index: int, state: _State) -> tuple[PairFailure | None, _State]:
+    """Detect, draw and write down one pair, or say why that cannot be done."""
+    stamps, journal, pictures = job.pairs.stamps(index), job.journal, job.pictures
     draw = pictures.missing(index, stamps[0])
-    known = stamps in journal.lines
+    known = job.is_done(stamps)
     if known and not draw:
-        return None, _followed(tracker, state, journal.text(stamps))[0] if pictures.any else state
+        followed = _followed(job.tracker, state.tracking, journal.text(stamps))[0] if pictures.any else state.tracking
+        return None, _State(followed, _learned(job, state.rig, stamps))
+    applied = state.rig.applicable(job.rig_config)
     try:
         started = time.perf_counter()
-        pair = pairs[index]
+        pair = corrected_pair(job.pairs[index], applied)
         decode_ms = (time.perf_counter() - started) * 1e3
-        analysis = detector.analyze(pair, decode_ms=decode_ms) if draw else None
-        detection = analysis.detection if analysis else detector.detect(pair, decode_ms=decode_ms)
+        analysis = job.detector.analyze(pair, decode_ms=decode_ms)
     except ViflowError as err:
         return PairFailure(*stamps, err.code, err.field, err.message), state
-    text = to_json(detection)
+    text, tracking = to_json(analysis.detection), state.tracking
     if pictures.any:
-        state, tracked = _followed(tracker, state, journal.text(stamps) if known else text)
-        if analysis is not None:
+        tracking, tracked = _followed(job.tracker, tracking, journal.text(stamps) if known else text)
+        if draw:
             pictures.write(index, stamps[0], overlay_of(pair, analysis, tracked))
     if not known:
-        journal.append(stamps, detection.status, text)
-    return None, state
+        if job.rig_config.enabled and analysis.predicted is not None:
+            job.rig.append(stamps, observe(pair, analysis.predicted.correction, job.rig_config, applied))
+        journal.append(stamps, analysis.detection.status, text)
+    return None, _State(tracking, _learned(job, state.rig, stamps))
+
+
+def _learned(job: _Job, rig: RigEstimate, stamps: Stamps) -> RigEstimate:
+    """One step of the rig's estimate, from what is written down."""
+    observation = job.rig.observations.get(stamps)
+    return rig if observation is None else update(rig, observation, job.rig_config)
 
 
 def _followed(tracker: Tracker | None, state: TrackingState, text: str | bytes) -> tuple[TrackingState, Detection]:

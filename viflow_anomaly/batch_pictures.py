@@ -16,17 +16,24 @@ from viflow_anomaly.detection import Detection
 from viflow_anomaly.drawing import OverlayVideo, draw_overlay
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.images import read_image_size
+from viflow_anomaly.prediction import PredictedFlow
 from viflow_anomaly.sensor_data import FramePair, Uint8Array
 
 
 class PairAnalysis(Protocol):
-    """What a picture needs besides the pair: the detection and the residual [H, W] it came from."""
+    """What a picture needs besides the pair: the detection and the residual [H, W] it came from.
+
+    ``predicted`` says how the camera turned; None for a detector that does not know.
+    """
 
     @property
     def detection(self) -> Detection: ...
 
     @property
     def residual(self) -> Float32Array | None: ...
+
+    @property
+    def predicted(self) -> PredictedFlow | None: ...
 
 
 class Pictures:

@@ -23,6 +23,7 @@ _DECISIVE = (
     "configuration.detector",
     "options.look_ahead",
     "options.tracking",
+    "options.rig_estimate",
     "recording.camera",
     "versions.viflow-anomaly",
 )

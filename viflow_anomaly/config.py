@@ -387,6 +387,42 @@ class TrackingConfig(FrozenConfig):
     )
 
 
+class RigEstimateConfig(FrozenConfig):
+    """The slow estimate of gyro bias, camera-IMU time offset and mounting over a stream; see ``rig_estimate``.
+
+    Prior deviations are those of data sheets and calibrations; drifts are deviations after a second, growing with the
+    root of time.
+    """
+
+    enabled: bool = True
+    apply: bool = Field(default=False, description="feed what is known well enough back into the next pairs")
+    bias_sigma_rad_s: float = Field(
+        default=0.05, gt=0, le=10, description="of the gyro's bias, before anything is seen"
+    )
+    offset_sigma_s: float = Field(default=0.03, gt=0, le=1, description="of the clocks, beside the calibrated offset")
+    mounting_sigma_rad: float = Field(
+        default=0.02, gt=0, le=1, description="of the mounting, beside the calibrated one"
+    )
+    bias_drift_rad_s: float = Field(default=2e-4, ge=0, le=1)
+    offset_drift_s: float = Field(default=1e-5, ge=0, le=1)
+    mounting_drift_rad: float = Field(default=1e-5, ge=0, le=1)
+    noise_scale: float = Field(default=0.5, gt=0, le=1e3, description="of the deviation that a pair's fit claims")
+    noise_floor_rad: float = Field(default=5e-4, gt=0, le=1, description="least deviation of a pair's measured turn")
+    lasting_sigma_rad: float = Field(
+        default=0.002, ge=0, le=1, description="of what the turns of neighbouring pairs err alike (depth misread)"
+    )
+    lasting_s: float = Field(default=1.0, gt=0, le=1e6, description="after which that is another error")
+    min_inlier_share: float = Field(default=0.3, ge=0, le=1, description="a pair below it says nothing")
+    huber_sigmas: float = Field(default=1.5, gt=0, le=100, description="beyond it a pair counts less")
+    gate_sigmas: float = Field(default=4.0, gt=0, le=100, description="beyond it a pair is an outlier")
+    reopen_after: PositiveInt = Field(default=20, description="outliers in a row after which the prior is back")
+    apply_bias_sigma_rad_s: float = Field(
+        default=0.005, gt=0, le=10, description="a bias whose deviations are below it may be applied"
+    )
+    apply_offset_sigma_s: float = Field(default=0.003, gt=0, le=1, description="likewise")
+    apply_mounting_sigma_rad: float = Field(default=0.002, gt=0, le=1, description="likewise")
+
+
 def loss_of_preset(preset: str) -> str:
     """The loss that ``TrainingConfig.loss`` "auto" stands for."""
     return {"paper": "squared", "compact": "charbonnier", "calibrated": "corrected"}[preset]

@@ -36,6 +36,18 @@ class RigidMotion(NamedTuple):
     translation: Float64Array
 
 
+class MeasuredTurn(NamedTuple):
+    """How the camera turned beside the rotation a correction began with; the images' word alone, without the prior.
+
+    Attributes:
+        turned_rad: [3] rotation vector in target-camera axes: rotation = exp(turned_rad) start.rotation.
+        covariance_rad2: [3, 3], the translation left open; as if each cell erred by ``NOISE_RAY`` on its own.
+    """
+
+    turned_rad: Float64Array
+    covariance_rad2: Float64Array
+
+
 class Correction(NamedTuple):
     """A corrected prediction.
 
@@ -49,6 +61,7 @@ class Correction(NamedTuple):
         converged: False: nothing to measure, or the prediction was no worse; it stands as it was.
         turned_rad: angle between the rotation of ``motion`` and the gyro's; 0 where that stands, and where the network
             gives flow only: without depth a rotation would also stand for the camera's translation.
+        turn: what the images say of the rotation beside ``start``'s, None likewise or where nothing converged.
     """
 
     flow_px: Float32Array
@@ -59,6 +72,7 @@ class Correction(NamedTuple):
     inverse_depth: Float32Array | None = None
     log_depth_ratio: Float32Array | None = None
     turned_rad: float = 0.0
+    turn: MeasuredTurn | None = None
 
 
 def rigid_flow_px(
@@ -84,6 +98,13 @@ def _moved(
     )
     nearness = 1 / np.maximum(pz, np.float32(MIN_DEPTH_RATIO))
     return px * nearness, py * nearness, inverse_depth * nearness
+
+
+class _NormalEquations(NamedTuple):
+    """[P, P] and [P] of the measurement alone."""
+
+    normal: Float64Array
+    gradient: Float64Array
 
 
 def correct_motion(
@@ -117,15 +138,20 @@ def correct_motion(
         error = goal - (moved_x, moved_y)
         weights = robust_weights(error, confidence, _tolerance(config, round_) / focal_px)
         _fill_jacobian(jacobian, moved_x, moved_y, nearness)
-        step = _weighted_step(jacobian, error, weights, prior, _pull(prior, turned))
+        equations = _normal_equations(jacobian, error, weights)
+        turn = _measured_turn(equations, prior, turned)
+        step = _solved(equations, prior, _pull(prior, turned))
         turned = turned + step[:3]
         motion = RigidMotion(so3_exp(step[:3]) @ motion.rotation, motion.translation + step[3:])
     before = rigid_flow_px(rays, inverse_depth, start, focal_px)
     after = rigid_flow_px(rays, inverse_depth, motion, focal_px)
     corrected = _accepted(before, after, measured, config, start, motion)
-    corrected = corrected._replace(inverse_depth=inverse_depth, log_depth_ratio=np.zeros_like(inverse_depth))
-    if corrected.converged:
-        corrected = corrected._replace(turned_rad=float(np.linalg.norm(turned)))
+    corrected = corrected._replace(
+        inverse_depth=inverse_depth,
+        log_depth_ratio=np.zeros_like(inverse_depth),
+        turn=turn if corrected.converged else None,
+        turned_rad=float(np.linalg.norm(turned)) if corrected.converged else 0.0,
+    )
     if not corrected.converged or not config.depth_rounds:
         return corrected
     log_ratio = _log_depth_ratio(rays, inverse_depth, motion, measured, focal_px, config)
@@ -259,11 +285,26 @@ def _weighted_step(
     jacobian: Float32Array, error: Float32Array, weights: Float32Array, prior: Float64Array, pull: Float64Array
 ) -> Float64Array:
     """Solve the normal equations of jacobian [2, P, N] and error [2, N], both in focal lengths."""
+    return _solved(_normal_equations(jacobian, error, weights), prior, pull)
+
+
+def _normal_equations(jacobian: Float32Array, error: Float32Array, weights: Float32Array) -> _NormalEquations:
     weighted = jacobian * (weights * np.float32(1 / NOISE_RAY**2))
     normal = (weighted[0] @ jacobian[0].T + weighted[1] @ jacobian[1].T).astype(np.float64)
     gradient = (weighted[0] @ error[0] + weighted[1] @ error[1]).astype(np.float64)
-    normal[np.diag_indices_from(normal)] += prior
-    return np.asarray(np.linalg.solve(normal, gradient + pull))
+    return _NormalEquations(normal, gradient)
+
+
+def _solved(equations: _NormalEquations, prior: Float64Array, pull: Float64Array) -> Float64Array:
+    return np.asarray(np.linalg.solve(equations.normal + np.diag(prior), equations.gradient + pull))
+
+
+def _measured_turn(equations: _NormalEquations, prior: Float64Array, turned: Float64Array) -> MeasuredTurn:
+    """The same step without the prior that holds the rotation near the gyro's; ``turned`` before it."""
+    free = prior.copy()
+    free[:3] = 1.0  # a radian: only what is not measured at all is left to it
+    covariance: Float64Array = np.asarray(np.linalg.inv(equations.normal + np.diag(free)), dtype=np.float64)
+    return MeasuredTurn(turned + (covariance @ equations.gradient)[:3], covariance[:3, :3])
 
 
 def _accepted(

@@ -25,6 +25,7 @@ from viflow_anomaly.config import (
     FrozenConfig,
     ImageLimits,
     ModelConfig,
+    RigEstimateConfig,
     RuntimeName,
     TrackingConfig,
     TrainingConfig,
@@ -73,6 +74,7 @@ class Settings(FrozenConfig):
     limits: ImageLimits = ImageLimits()
     detector: DetectorConfig = DetectorConfig()
     tracking: TrackingConfig = TrackingConfig()
+    rig_estimate: RigEstimateConfig = RigEstimateConfig()
     model: ModelConfig = ModelConfig()
     training: TrainingConfig = TrainingConfig()
     evidence_training: EvidenceTrainingConfig = EvidenceTrainingConfig()

@@ -19,11 +19,13 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from viflow_anomaly.config import FrozenConfig, TrackingConfig
+from viflow_anomaly.config import FrozenConfig, RigEstimateConfig, TrackingConfig
 from viflow_anomaly.detection import Detection, Reason
 from viflow_anomaly.errors import ViflowError
 from viflow_anomaly.imu_log import ImuLog
-from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples, PinholeCamera
+from viflow_anomaly.prediction import PredictedFlow
+from viflow_anomaly.rig_estimate import OFFSET, RigEstimate, corrected_pair, observe, update
+from viflow_anomaly.sensor_data import Float64Array, Frame, FramePair, ImuSamples, PinholeCamera
 from viflow_anomaly.tracking import Tracker, TrackingState
 
 
@@ -33,6 +35,7 @@ class StreamConfig(FrozenConfig):
     ``before_s``, ``after_s``: how much IMU a pair gets ahead of its source and waits for behind its target (the paper's
     motion windows reach beyond it). ``max_frame_delay_s``: how long after its IMU samples a frame may come.
     ``max_waiting_frames``: kept while their IMU is not there yet. ``tracking``: None leaves ``track_id`` null.
+    ``rig_estimate``: what the stream learns of the IMU and its mounting.
     """
 
     before_s: NonNegativeFloat = 0.25
@@ -41,12 +44,23 @@ class StreamConfig(FrozenConfig):
     max_waiting_frames: int = Field(default=8, ge=1, le=1024)
     max_imu_samples: int = Field(default=20_000, ge=2)
     tracking: TrackingConfig | None = TrackingConfig()
+    rig_estimate: RigEstimateConfig = RigEstimateConfig()
+
+
+class Judged(Protocol):
+    """A detection, and how the camera turned; None from a detector that does not know."""
+
+    @property
+    def detection(self) -> Detection: ...
+
+    @property
+    def predicted(self) -> PredictedFlow | None: ...
 
 
 class PairJudge(Protocol):
     """What a stream needs of ``viflow_anomaly.detector.AnomalyDetector``."""
 
-    def detect(self, pair: FramePair, *, decode_ms: float = 0.0) -> Detection: ...
+    def analyze(self, pair: FramePair, *, decode_ms: float = 0.0) -> Judged: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +71,13 @@ class StreamState:
         imu: the samples that a pair may still need.
         frames: the source of the next pair and the frames behind it that wait for their IMU.
         tracking: after the last pair that was judged.
+        rig: likewise; None before the first pair that said something of the rig.
     """
 
     imu: ImuLog | None = None
     frames: tuple[Frame, ...] = ()
     tracking: TrackingState = field(default_factory=TrackingState)
+    rig: RigEstimate | None = None
 
 
 class StreamStep(NamedTuple):
@@ -113,14 +129,13 @@ class DetectionStream:
         detections = []
         while len(state.frames) > 1:
             source, target = state.frames[:2]
-            there = self._is_covered(state.imu, target)
+            there = self._is_covered(state, target)
             if not there and len(state.frames) <= self.config.max_waiting_frames:
                 break
             if there:
                 try:
-                    tracking, detection = self._judge(state, source, target)
+                    state, detection = self._judge(state, source, target)
                     detections.append(detection)
-                    state = replace(state, tracking=tracking)
                 except ViflowError as err:
                     faults.append(Reason(err.code, f"pair at {source.timestamp_ns} ns: {err.message}"))
             else:
@@ -129,24 +144,35 @@ class DetectionStream:
         imu, dropped = self._kept(state)
         return StreamStep(replace(state, imu=imu), tuple(detections), (*faults, *dropped))
 
-    def _judge(self, state: StreamState, source: Frame, target: Frame) -> tuple[TrackingState, Detection]:
+    def _judge(self, state: StreamState, source: Frame, target: Frame) -> tuple[StreamState, Detection]:
         assert state.imu is not None
-        start_ns = source.timestamp_ns + self._offset_ns - round(self.config.before_s * 1e9)
-        end_ns = target.timestamp_ns + self._offset_ns + round(self.config.after_s * 1e9)
+        applied, offset_ns = self._applied(state), self._offset_ns(state)
+        start_ns = source.timestamp_ns + offset_ns - round(self.config.before_s * 1e9)
+        end_ns = target.timestamp_ns + offset_ns + round(self.config.after_s * 1e9)
         pair = FramePair(source, target, state.imu.between(start_ns, end_ns), self.camera)
-        detection = self.detector.detect(pair)
-        if self.config.tracking is None:
-            return state.tracking, detection
-        return Tracker(self.config.tracking).update(state.tracking, detection)
+        pair = corrected_pair(pair, applied)
+        judged = self.detector.analyze(pair)
+        tracking, detection = state.tracking, judged.detection
+        if self.config.tracking is not None:
+            tracking, detection = Tracker(self.config.tracking).update(tracking, detection)
+        config, predicted, rig = self.config.rig_estimate, judged.predicted, state.rig
+        observation = observe(pair, predicted.correction if predicted else None, config, applied)
+        if observation is not None and config.enabled:
+            rig = update(rig or RigEstimate.prior(config), observation, config)
+        return replace(state, tracking=tracking, rig=rig), detection
 
-    @property
-    def _offset_ns(self) -> int:
-        """t_imu - t_cam."""
-        return 0 if self.camera is None else round(self.camera.time_offset_s * 1e9)
+    def _applied(self, state: StreamState) -> Float64Array:
+        config = self.config.rig_estimate
+        return (state.rig or RigEstimate.prior(config)).applicable(config)
 
-    def _is_covered(self, imu: ImuLog | None, target: Frame) -> bool:
-        needed_ns = target.timestamp_ns + self._offset_ns + round(self.config.after_s * 1e9)
-        return imu is not None and int(imu.timestamps_ns[-1]) >= needed_ns
+    def _offset_ns(self, state: StreamState) -> int:
+        """t_imu - t_cam, as far as it is known by now."""
+        known_s = 0.0 if self.camera is None else self.camera.time_offset_s
+        return round((known_s + float(self._applied(state)[OFFSET][0])) * 1e9)
+
+    def _is_covered(self, state: StreamState, target: Frame) -> bool:
+        needed_ns = target.timestamp_ns + self._offset_ns(state) + round(self.config.after_s * 1e9)
+        return state.imu is not None and int(state.imu.timestamps_ns[-1]) >= needed_ns
 
     def _kept(self, state: StreamState) -> tuple[ImuLog | None, list[Reason]]:
         """The samples that the frames at hand, or one that comes as late as it may, can need."""
@@ -156,7 +182,7 @@ class DetectionStream:
         stamps_ns = imu.timestamps_ns
         oldest_ns = int(stamps_ns[-1]) - round(self.config.max_frame_delay_s * 1e9)
         if state.frames:
-            oldest_ns = min(oldest_ns, state.frames[0].timestamp_ns + self._offset_ns)
+            oldest_ns = min(oldest_ns, state.frames[0].timestamp_ns + self._offset_ns(state))
         first = int(np.searchsorted(stamps_ns, oldest_ns - round(self.config.before_s * 1e9), side="right")) - 1
         first, surplus = max(first, 0), len(imu) - max(first, 0) - self.config.max_imu_samples
         if surplus <= 0:

@@ -66,6 +66,9 @@ def test_options_reach_the_run(ask: Ask, pair: PairFolder, tmp_path: Path) -> No
     answer = ask(["batch", str(pair.folder), "--out", str(out), *which, *how])
     assert answer.code == 0
     run = json.loads((out / "run.json").read_text())
+    rig_estimate = run["options"].pop("rig_estimate")
+    assert (rig_estimate["enabled"], rig_estimate["apply"]) == (True, False)
+    assert run["rig_estimate"] is None  # this detector does not know how the camera turned
     tracking = run["options"].pop("tracking")
     assert run["options"] == {"look_ahead": 2, "limit": 1, "overlays": "all", "video": True}
     assert (tracking["max_tracks"], tracking["max_gap_s"]) == (9, 0.6)

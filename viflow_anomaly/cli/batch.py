@@ -95,6 +95,7 @@ def batch(
         overlays="all" if overlays == "all" else int(overlays),
         video=video,
         tracking=settings.tracking if track else None,
+        rig_estimate=settings.rig_estimate,
         resume=resume,
         overwrite=overwrite,
     )
