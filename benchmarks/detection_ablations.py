@@ -34,21 +34,38 @@ DEFAULT = "default"
 
 # Name -> what is changed in the detector's configuration. A new step (learned evidence, persistence over frames) is one
 # more line here, switched off, or on where the default is without it.
+RESIDUAL: dict[str, Any] = {"evidence": "residual"}
 VARIANTS: dict[str, dict[str, Any]] = {
     DEFAULT: {},
-    "morphology off": {"regions": {"opening_fraction": 0, "closing_fraction": 0}},
-    "opening off": {"regions": {"opening_fraction": 0}},
-    "closing off": {"regions": {"closing_fraction": 0}},
     "shape rule: thickness": {"regions": {"shape_rule": "thickness"}},
     "shape rule: oriented": {"regions": {"shape_rule": "oriented"}},
     "shape rule: none": {"regions": {"shape_rule": "none"}},
-    "gradient normalisation off": {"regions": {"texture_softening_gray": 0}},
-    "gradient normalisation off, from 12 gray on": {"regions": {"texture_softening_gray": 0, "min_residual_gray": 12}},
-    "exposure compensation on": {"photometric_compensation": True},
-    "minimum over hypotheses": {"residual": "minimum"},
-    "correction off": {"correction": {"enabled": False}},
-    "correction off, minimum over hypotheses": {"correction": {"enabled": False}, "residual": "minimum"},
+    "correction off": {"correction": {"enabled": False}, "evidence": "learned"},
     "depth refinement off": {"correction": {"depth_rounds": 0}},
+    "exposure compensation off": {"photometric_compensation": False},
+    "minimum over hypotheses": {"residual": "minimum"},
+    "gradient normalisation off": {"regions": {"texture_softening_gray": 0}},
+    "evidence head off": RESIDUAL,
+    "head off, morphology off": {**RESIDUAL, "regions": {"opening_fraction": 0, "closing_fraction": 0}},
+    "head off, opening off": {**RESIDUAL, "regions": {"opening_fraction": 0}},
+    "head off, closing off": {**RESIDUAL, "regions": {"closing_fraction": 0}},
+    "head off, shape rule: thickness": {**RESIDUAL, "regions": {"shape_rule": "thickness"}},
+    "head off, shape rule: oriented": {**RESIDUAL, "regions": {"shape_rule": "oriented"}},
+    "head off, shape rule: none": {**RESIDUAL, "regions": {"shape_rule": "none"}},
+    "head off, gradient normalisation off": {**RESIDUAL, "regions": {"texture_softening_gray": 0}},
+    "head off, gradient normalisation off, from 12 gray on": {
+        **RESIDUAL,
+        "regions": {"texture_softening_gray": 0, "min_residual_gray": 12},
+    },
+    "head off, exposure compensation off": {**RESIDUAL, "photometric_compensation": False},
+    "head off, minimum over hypotheses": {**RESIDUAL, "residual": "minimum"},
+    "head off, correction off": {**RESIDUAL, "correction": {"enabled": False}},
+    "head off, correction off, minimum over hypotheses": {
+        **RESIDUAL,
+        "correction": {"enabled": False},
+        "residual": "minimum",
+    },
+    "head off, depth refinement off": {**RESIDUAL, "correction": {"depth_rounds": 0}},
 }
 
 FIGURES: tuple[tuple[str, str, int], ...] = (

@@ -104,7 +104,7 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> FramePair:
 
 def test_a_detector_is_measured_as_a_user_runs_it(detector: AnomalyDetector, two: FramePair) -> None:
     regions = RegionConfig(min_residual_gray=3.0, threshold_mads=2.0)
-    configured = detector.with_config(DetectorConfig(regions=regions))
+    configured = detector.with_config(DetectorConfig(regions=regions, evidence="residual"))
     method = DetectorMethod(OURS, configured)
     judgement = method.judge(two)
     detection = configured.detect(two)

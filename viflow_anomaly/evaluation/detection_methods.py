@@ -132,7 +132,9 @@ class RivalMethod:
         self.motor_source = motor_source
         self._evidence = evidence
         self._configs = {
-            thresholds: config.model_copy(update={**thresholds._asdict(), "shape_rule": "axis_aligned"})
+            thresholds: config.model_copy(
+                update={**thresholds._asdict(), "shape_rule": "axis_aligned", "motion_score": 0.5}
+            )
             for thresholds in RIVAL_THRESHOLDS
         }
 

@@ -20,7 +20,8 @@ Figures = dict[str, Any]
 
 
 def draw_detection_figures(folder: Path, report: Report) -> list[SavedPicture]:
-    """``precision-recall-GROUP``, ``recall-alarms-GROUP`` and ``ap-classes-GROUP`` of each group with movers.
+    """``precision-recall-GROUP``, ``recall-alarms-GROUP``, ``ap-classes-GROUP`` and, without the rivals, whose scores
+    are no probabilities, ``reliability-GROUP`` of each group with movers.
 
     Args:
         folder: made when it is not there.
@@ -36,6 +37,9 @@ def draw_detection_figures(folder: Path, report: Report) -> list[SavedPicture]:
             pictures.append(precision_recall(figures, folder / f"precision-recall-{name}", title=scope))
             pictures.append(recall_by_alarms(figures, folder / f"recall-alarms-{name}", title=scope))
             pictures.append(precision_by_class(figures, folder / f"ap-classes-{name}", title=scope))
+            own = {method: one for method, one in figures.items() if not report["methods"][method]["best_thresholds"]}
+            if any(one["reliability"] for one in own.values()):
+                pictures.append(reliability(own, folder / f"reliability-{name}", title=scope))
     return pictures
 
 
@@ -130,6 +134,35 @@ def precision_by_class(figures: Figures, stem: Path, *, title: str | None = None
         figure.axes[0].set_ylabel("ROI AP")
         _titled(figure.axes[0], title)
         figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right center")
+    return saved(stem)
+
+
+def reliability(figures: Figures, stem: Path, *, title: str | None = None) -> SavedPicture:
+    """Share of regions that move by themselves against their score; a marker's area tells how many there are.
+
+    Raises:
+        InvalidInputError: ``plot_empty`` without any region; as ``drawing``.
+    """
+    known = {name: one["reliability"] for name, one in figures.items() if one["reliability"]}
+    if not known:
+        raise _empty("a region")
+    with drawing(stem, height_in=3.6) as figure:
+        axes = figure.add_subplot()
+        axes.plot((0, 1), (0, 1), color="0.6", lw=0.8)
+        for index, (name, bins) in enumerate(known.items()):
+            style = look(index)
+            scores, shares = ([one[key] for one in bins] for key in ("mean_score", "share_moving"))
+            most = max(one["regions"] for one in bins)
+            areas = [20 + 100 * one["regions"] / most for one in bins]
+            axes.plot(scores, shares, color=style.color, ls=style.line, lw=0.8)
+            label = f"{name} (ECE {figures[name]['score_ece']:.3f})"
+            axes.scatter(scores, shares, s=areas, color=style.color, marker=style.marker, label=label)
+        axes.set_xlabel("score")
+        axes.set_ylabel("share that moves by itself")
+        axes.set_xlim(0, 1)
+        axes.set_ylim(0, 1.02)
+        _titled(axes, title)
+        figure.legend(loc="outside lower center", ncols=1)
     return saved(stem)
 
 

@@ -116,6 +116,9 @@ def _figures(by_method: ByMethod, chosen: Mapping[str, Thresholds]) -> dict[str,
             "by_size": {one: _class_figures(boxes.of_size(one)) for one in SIZE_CLASSES},
             "by_speed": {one: _class_figures(boxes.of_speed(one)) for one in SPEED_CLASSES},
             "curve": _curve(boxes),
+            "reliability": [
+                {name: rounded(value) for name, value in one._asdict().items()} for one in boxes.reliability()
+            ],
         }
     return figures
 

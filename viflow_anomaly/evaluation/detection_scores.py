@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +34,8 @@ SPEED_CLASSES: dict[str, tuple[float, float]] = {
 }
 """Independent motion in pixels a frame, likewise."""
 
+RELIABILITY_BINS = 10
+
 Curve = NDArray[np.float64]
 
 
@@ -51,6 +54,16 @@ class _Judged(NamedTuple):
     motion: bool
     found: TrueObject | None
     box_area_px: int
+
+
+class ReliabilityBin(NamedTuple):
+    """Regions that score from ``low`` up to below ``high``."""
+
+    low: float
+    high: float
+    regions: int
+    mean_score: float
+    share_moving: float
 
 
 class OperatingCurve(NamedTuple):
@@ -140,9 +153,28 @@ class DetectionScores:
             "recall": rounded(hits / len(self.movers) if any_movers else None),
             "precision": rounded(hits / (hits + alarms) if hits + alarms else None),
             **{f"recall_at_{rate:g}_false_alarms": rounded(self._recall_at(rate, curve)) for rate in FALSE_ALARM_RATES},
+            "score_ece": rounded(self.calibration_error()),
             "false_alarms_per_frame": rounded(alarms / self.frames if self.frames else None),
             "false_alarms_per_minute": rounded(60 * alarms / self.seconds if self.seconds else None),
         }
+
+    def reliability(self) -> list[ReliabilityBin]:
+        """Of the regions in each tenth of the score that holds any: their mean score, and which share moves."""
+        edges = np.linspace(0, 1, RELIABILITY_BINS + 1)
+        bins = []
+        for low, high in pairwise(edges):
+            inside = [one for one in self._judged if low <= one.score < high or (high == 1 and one.score == 1)]
+            if inside:
+                mean_score = float(np.mean([one.score for one in inside]))
+                share = sum(one.found is not None for one in inside) / len(inside)
+                bins.append(ReliabilityBin(float(low), float(high), len(inside), mean_score, share))
+        return bins
+
+    def calibration_error(self) -> float | None:
+        """Expected calibration error: the mean gap between score and share, weighted by regions; None without any."""
+        bins = self.reliability()
+        total = sum(one.regions for one in bins)
+        return sum(one.regions * abs(one.mean_score - one.share_moving) for one in bins) / total if total else None
 
     def curve(self) -> OperatingCurve:
         """Recall, precision and false alarms, as the threshold on the score falls past each distinct score."""

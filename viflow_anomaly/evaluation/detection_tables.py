@@ -17,6 +17,7 @@ FIGURES: tuple[tuple[str, str, int], ...] = (
     ("@0.01", "recall_at_0.01_false_alarms", 3),
     ("alarms/frame", "false_alarms_per_frame", 2),
     ("/min", "false_alarms_per_minute", 1),
+    ("ECE", "score_ece", 3),
     ("pixel AP", "pixel_ap", 3),
     ("best IoU", "pixel_iou_best", 3),
     ("IoU", "pixel_iou", 3),
@@ -105,6 +106,7 @@ def notes(report: Report) -> list[str]:
         "recall, precision, alarms and IoU: of regions labelled as motion; "
         "recall @0.1, @0.01: where the score's threshold leaves as many false alarms a frame; the curves (AP, best F1) "
         "are over all regions.",
+        "ECE: expected calibration error, how far a region's score is from the share of such regions that move.",
         f"Size: px of the mover's box, {classes('size_classes_box_px')}. "
         f"Speed: px of independent motion a frame, {classes('speed_classes_px')}.",
         f"Commit {(report['commit'] or 'unknown')[:12]}, {report['date'][:10]}, model {report['model']['name']}.",
