@@ -36,12 +36,13 @@ from viflow_anomaly.detection import ImageSize, rois_from_regions
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import ViflowError
 from viflow_anomaly.evaluation.flow_report import cpu_model
+from viflow_anomaly.evidence_cues import evidence_cues
+from viflow_anomaly.explanation import explain
 from viflow_anomaly.geometry import Float32Array, pixel_grid, unproject_pixels
 from viflow_anomaly.model_input import prepare
+from viflow_anomaly.motion_evidence import judge_cues, regions_of, takes_head
 from viflow_anomaly.prediction import correct
-from viflow_anomaly.regions import find_regions
-from viflow_anomaly.residual import half_range_gray, photometric_residual, reconstruct, texture_normalised
-from viflow_anomaly.runtime.loading import load_runtime
+from viflow_anomaly.runtime.loading import load_evidence, load_runtime
 from viflow_anomaly.sensor_data import Frame, FramePair, PinholeCamera, Uint8Array
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -50,7 +51,7 @@ CAMERAS = ("none", "pinhole", "radtan")
 EUROC_HEIGHT_PX, EUROC_FOCAL_PX = 480, (458.654, 457.296)
 EUROC_RADTAN = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
 MIN_REPEATS = 50
-STAGES = ("view", "network", "correction", "reconstruct", "regions")
+STAGES = ("view", "network", "correction", "reconstruct", "cues", "head", "regions")
 
 
 @dataclass(frozen=True)
@@ -105,30 +106,35 @@ class Stages:
 
     def __init__(self, checkpoint: Path | None, detector: AnomalyDetector, runtime: RuntimeName) -> None:
         self._runtime, self._record = load_runtime(checkpoint, runtime=runtime, threads=1)
+        self._head = load_evidence(None, runtime=runtime, threads=1)
         self._config = detector.config
 
     def run(self, pair: FramePair) -> list[float]:
-        """Milliseconds of view (both images and the IMU window), network, correction, reconstruct, regions."""
+        """Milliseconds of ``STAGES``; view is both images and the IMU window."""
         clock = [time.perf_counter()]
+
+        def lap() -> None:
+            clock.append(time.perf_counter())
+
         model_input = prepare(pair, self._record.model)
-        clock.append(time.perf_counter())
+        lap()
         hypotheses = self._runtime.predict(model_input)
-        clock.append(time.perf_counter())
+        lap()
         focal_px = self._record.model.view.focal_px
         predicted = correct(hypotheses, model_input, self._config.correction, focal_px=focal_px)
-        clock.append(time.perf_counter())
-        coordinates = model_input.view.target_coordinates(predicted.flow_px, predicted.stride)
-        reconstruction, inside = reconstruct(pair.target.image, coordinates)
-        if (analyzed := model_input.view.analyzed()) is not None:
-            inside &= analyzed
-        residual = photometric_residual(pair.source.image, reconstruction, inside)
-        clock.append(time.perf_counter())
-        height, width = residual.shape
-        config = self._config.regions
-        evidence = texture_normalised(residual, half_range_gray(pair.source.image), config.texture_softening_gray)
-        regions = find_regions(evidence, inside, config, residual=residual).regions
-        rois_from_regions(regions, ImageSize(width=width, height=height))
-        clock.append(time.perf_counter())
+        lap()
+        explained = explain(pair, model_input, predicted, self._config)
+        lap()
+        takes = takes_head(self._head, explained, self._config)
+        cues = evidence_cues(explained, focal_px=focal_px) if takes else None
+        lap()
+        judged = None if cues is None else judge_cues(self._head, cues, explained)
+        lap()
+        height, width = explained.source.shape
+        rois_from_regions(
+            regions_of(explained, judged, self._head, self._config), ImageSize(width=width, height=height)
+        )
+        lap()
         return [(after - before) * 1e3 for before, after in pairwise(clock)]
 
 

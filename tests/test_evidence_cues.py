@@ -13,10 +13,12 @@ from viflow_anomaly.evidence_cues import (
     HALF_REMAINING_PX,
     PHOTOMETRIC_CUES,
     EvidenceCues,
-    Reconstructed,
     evidence_cues,
 )
+from viflow_anomaly.explanation import Explanation
 from viflow_anomaly.measured_flow import measure_remaining_flow
+from viflow_anomaly.model_input import ModelInput
+from viflow_anomaly.motion_input import MotionWindow
 from viflow_anomaly.prediction import PredictedFlow
 from viflow_anomaly.residual import half_range_gray, photometric_residual, texture_normalised
 from viflow_anomaly.sensor_data import Uint8Array
@@ -47,8 +49,14 @@ def cues_of(source: Uint8Array, rebuilt: Uint8Array, *, translation: tuple[float
     reconstruction = rebuilt.astype(np.float32)
     half_range = half_range_gray(source)
     normalised = texture_normalised(photometric_residual(source, reconstruction, inside), half_range, 10.0)
-    drawn = Reconstructed(source, reconstruction, inside, normalised, half_range)
-    return evidence_cues(drawn, predicted((view.width, view.height), translation), view, focal_px=116.0)
+    model_input = ModelInput(source, source, MotionWindow(np.zeros((16, 6), np.float32), 0.05, ()), view)
+    flows = predicted((view.width, view.height), translation)
+    residual = photometric_residual(source, reconstruction, inside)
+    coordinates = view.target_coordinates(flows.flow_px, STRIDE)
+    return evidence_cues(
+        Explanation(source, model_input, flows, coordinates, reconstruction, inside, residual, half_range, normalised),
+        focal_px=116.0,
+    )
 
 
 def with_shifted_box(source: Uint8Array, du: int, dv: int) -> Uint8Array:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from viflow_anomaly.checkpoint_record import CheckpointRecord, EvidenceRecord
+from viflow_anomaly.checkpoint_record import CheckpointRecord
 from viflow_anomaly.config import DetectorConfig, MotorSource, RuntimeName
 from viflow_anomaly.detection import (
     AnalyzedRegion,
@@ -22,28 +21,15 @@ from viflow_anomaly.detection import (
     Roi,
     rois_from_regions,
 )
-from viflow_anomaly.errors import CheckpointError, ConfigError
-from viflow_anomaly.evidence_cues import (
-    GEOMETRIC_CUES,
-    PHOTOMETRIC_CUES,
-    EvidenceCues,
-    Reconstructed,
-    evidence_cues,
-)
+from viflow_anomaly.errors import ConfigError
+from viflow_anomaly.evidence_cues import EvidenceCues, evidence_cues
+from viflow_anomaly.explanation import Explanation, explain
 from viflow_anomaly.geometry import Float32Array, pixel_grid
-from viflow_anomaly.model_input import ModelInput, prepare
+from viflow_anomaly.model_input import prepare
+from viflow_anomaly.motion_evidence import JudgedCues, judge_cues, regions_of, require_our_cues, takes_head
 from viflow_anomaly.motion_input import MotionWindow
-from viflow_anomaly.moving_regions import MotionMaps, find_moving_regions
 from viflow_anomaly.pair_quality import Finding, judge_correction, judge_images, judge_window
 from viflow_anomaly.prediction import PredictedFlow, predict_flow
-from viflow_anomaly.regions import Region, find_regions
-from viflow_anomaly.residual import (
-    compensate_exposure,
-    half_range_gray,
-    photometric_residual,
-    reconstruct,
-    texture_normalised,
-)
 from viflow_anomaly.runtime.interface import Runtime
 from viflow_anomaly.runtime.loading import LoadedEvidence, load_evidence, load_runtime
 from viflow_anomaly.sensor_data import FramePair
@@ -88,24 +74,6 @@ class Analysis(NamedTuple):
     def flow_px(self) -> Float32Array:
         """[H, W, 2] float32 flow of the static world in source pixels."""
         return self.target_coordinates - pixel_grid(*self.residual.shape)
-
-
-class _Explained(NamedTuple):
-    """A pair after prediction and reconstruction, before anything is judged."""
-
-    model_input: ModelInput
-    predicted: PredictedFlow
-    target_coordinates: Float32Array
-    inside: NDArray[np.bool_]
-    residual: Float32Array
-    rebuilt: Reconstructed
-
-
-class JudgedCues(NamedTuple):
-    """What the evidence head was shown, and what it says."""
-
-    cues: EvidenceCues
-    maps: MotionMaps
 
 
 class AnomalyDetector:
@@ -177,7 +145,7 @@ class AnomalyDetector:
         evidence = None
         if with_evidence:
             evidence = load_evidence(evidence_head, runtime=runtime, device=device, threads=threads)
-            _require_our_cues(evidence.record)
+            require_our_cues(evidence.record)
         return cls(loaded, record, config=config or DetectorConfig(), evidence=evidence)
 
     @property
@@ -200,7 +168,7 @@ class AnomalyDetector:
         Raises:
             CheckpointError: ``evidence_cues_differ``.
         """
-        _require_our_cues(evidence.record)
+        require_our_cues(evidence.record)
         return AnomalyDetector(self._runtime, self._record, config=self.config, evidence=evidence)
 
     def detect(self, pair: FramePair, *, decode_ms: float = 0.0) -> Detection:
@@ -216,8 +184,9 @@ class AnomalyDetector:
         """``detect`` with its maps; same errors. The paper's algorithm on one screen."""
         started = time.perf_counter()
         explained = self._explain(pair)
-        model_input, predicted, coordinates, inside = explained[:4]
-        residual, judged = explained.residual, self._judged_cues(explained)
+        judged = self._judged_cues(explained)
+        model_input, predicted = explained.model_input, explained.predicted
+        residual, inside = explained.residual, explained.inside
         inferred = time.perf_counter()
         x, y, region_width, region_height = model_input.view.region()
         summary = _summary(residual, inside, self.config.min_overlap, region_width * region_height)
@@ -231,9 +200,9 @@ class AnomalyDetector:
         rois: tuple[Roi, ...] = ()
         if not abstained:
             image = ImageSize(width=residual.shape[1], height=residual.shape[0])
-            regions = self._regions(explained, judged)
+            regions = regions_of(explained, judged, self._evidence, self.config)
             rois = rois_from_regions(
-                regions, image, include_masks=self.config.include_masks, target_coordinates=coordinates
+                regions, image, include_masks=self.config.include_masks, target_coordinates=explained.target_coordinates
             )
         finished = time.perf_counter()
         timings_ms = {
@@ -255,8 +224,9 @@ class AnomalyDetector:
             residual=summary,
             timings_ms=timings_ms,
         )
-        evidence = explained.rebuilt.normalised if judged is None else judged.maps.motion
-        return Analysis(detection, residual, evidence, inside, explained.rebuilt.reconstruction, coordinates, predicted)
+        evidence = explained.normalised if judged is None else judged.maps.motion
+        maps = (residual, evidence, inside, explained.reconstruction, explained.target_coordinates)
+        return Analysis(detection, *maps, predicted)
 
     def judge_cues(self, pair: FramePair) -> tuple[JudgedCues, NDArray[np.bool_]] | None:
         """What the head says of a pair, and which pixels [H, W] are inside; None where regions come from the residual.
@@ -273,89 +243,27 @@ class AnomalyDetector:
         explained = self._explain(pair)
         return self._cues(explained), explained.inside
 
-    def _judged_cues(self, explained: _Explained) -> JudgedCues | None:
+    def _cues(self, explanation: Explanation) -> EvidenceCues:
+        return evidence_cues(explanation, focal_px=self._record.model.view.focal_px)
+
+    def _judged_cues(self, explanation: Explanation) -> JudgedCues | None:
         """What the head makes of it; None: regions are found in the residual."""
-        correction = explained.predicted.correction
-        knows_depth = correction is not None and correction.motion is not None
-        if self._evidence is None or self.config.evidence == "residual":
+        if self._evidence is None or not takes_head(self._evidence, explanation, self.config):
             return None
-        if self.config.evidence == "auto" and not knows_depth:
-            return None
-        cues = self._cues(explained)
-        height, width = explained.residual.shape
-        logits = self._evidence.runtime.judge(*cues)[:, :height, :width]
-        return JudgedCues(cues, MotionMaps(*(_sigmoid(one) for one in logits)))
+        return judge_cues(self._evidence, self._cues(explanation), explanation)
 
-    def _regions(self, explained: _Explained, judged: JudgedCues | None) -> Sequence[Region]:
-        config, residual, inside = self.config.regions, explained.residual, explained.inside
-        if judged is None or self._evidence is None:
-            return find_regions(explained.rebuilt.normalised, inside, config, residual=residual).regions
-        score = self._evidence.record.region_score
-        return find_moving_regions(judged.maps, judged.cues, inside, config, residual=residual, score=score)
-
-    def _cues(self, explained: _Explained) -> EvidenceCues:
-        view, focal_px = explained.model_input.view, self._record.model.view.focal_px
-        return evidence_cues(explained.rebuilt, explained.predicted, view, focal_px=focal_px)
-
-    def _explain(self, pair: FramePair) -> _Explained:
-        """Predict the static world's flow, rebuild the source from the target by it, and compare the two."""
-        source = pair.source.image
+    def _explain(self, pair: FramePair) -> Explanation:
+        """Predict the static world's flow, and see what it leaves unexplained."""
         model_input = prepare(pair, self._record.model)
         focal_px = self._record.model.view.focal_px
         predicted = predict_flow(self._runtime, model_input, self.config.correction, focal_px=focal_px)
-        coordinates = model_input.view.target_coordinates(predicted.flow_px, predicted.stride)
-        reconstruction, inside = reconstruct(pair.target.image, coordinates)
-        if (analyzed := model_input.view.analyzed()) is not None:
-            inside &= analyzed
-        if self.config.photometric_compensation:
-            reconstruction = compensate_exposure(reconstruction, source, inside)
-        residual = self._residual(pair, model_input, predicted, reconstruction, inside)
-        half_range = half_range_gray(source)
-        normalised = texture_normalised(residual, half_range, self.config.regions.texture_softening_gray)
-        rebuilt = Reconstructed(source, reconstruction, inside, normalised, half_range)
-        return _Explained(model_input, predicted, coordinates, inside, residual, rebuilt)
-
-    def _residual(
-        self,
-        pair: FramePair,
-        model_input: ModelInput,
-        predicted: PredictedFlow,
-        reconstruction: Float32Array,
-        inside: NDArray[np.bool_],
-    ) -> Float32Array:
-        """[H, W] of the winner, or the smallest over all hypotheses."""
-        source = pair.source.image
-        residual = photometric_residual(source, reconstruction, inside)
-        for flow_px in predicted.hypotheses_px if self.config.residual == "minimum" else ():
-            coordinates = model_input.view.target_coordinates(flow_px, predicted.stride)
-            rebuilt, reached = reconstruct(pair.target.image, coordinates)
-            both = inside & reached
-            if self.config.photometric_compensation:
-                rebuilt = compensate_exposure(rebuilt, source, both)
-            np.minimum(residual, photometric_residual(source, rebuilt, both), out=residual, where=both)
-        return residual
+        return explain(pair, model_input, predicted, self.config)
 
 
 def _judge_input(pair: FramePair, window: MotionWindow, config: DetectorConfig) -> tuple[Finding, ...]:
     """What can be said against the pair before anything is predicted."""
     of_images = judge_images(pair.source.image, pair.target.image, window, config)
     return (*judge_window(window), *of_images)
-
-
-def _require_our_cues(record: EvidenceRecord) -> None:
-    expected, found = (PHOTOMETRIC_CUES, GEOMETRIC_CUES), (record.photometric_cues, record.geometric_cues)
-    if expected != found:
-        raise CheckpointError(
-            f"evidence head {record.name} {record.version}: expected one that was trained on the cues {expected}, "
-            f"found {found}",
-            code="evidence_cues_differ",
-            field="evidence_head",
-        )
-
-
-def _sigmoid(logits: Float32Array) -> Float32Array:
-    """exp(-87) is the last that float32 knows; beyond it the answer is the same."""
-    return np.asarray(1 / (1 + np.exp(-np.clip(logits, -80, 80))), dtype=np.float32)
 
 
 def _doubts(predicted: PredictedFlow, window: MotionWindow, config: DetectorConfig) -> tuple[Finding, ...]:

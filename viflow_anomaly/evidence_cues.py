@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from viflow_anomaly.config import EVIDENCE_BLOCK_PX
 from viflow_anomaly.correction import parallax_slope
+from viflow_anomaly.explanation import Explanation
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.measured_flow import measure_remaining_flow
 from viflow_anomaly.prediction import PredictedFlow, view_rays
-from viflow_anomaly.sensor_data import Uint8Array
 from viflow_anomaly.view import InternalView
 
 PHOTOMETRIC_CUES = ("difference", "normalised residual", "half range")
@@ -64,39 +64,23 @@ class EvidenceCues(NamedTuple):
     geometric: Float32Array
 
 
-class Reconstructed(NamedTuple):
-    """The source beside what the prediction makes of the target: [H, W] each.
-
-    ``normalised`` is the texture-normalised residual, ``half_range`` what it was normalised by.
-    """
-
-    source: Uint8Array
-    reconstruction: Float32Array
-    inside: NDArray[np.bool_]
-    normalised: Float32Array
-    half_range: Float32Array
-
-
-def evidence_cues(
-    reconstructed: Reconstructed, predicted: PredictedFlow, view: InternalView, *, focal_px: float
-) -> EvidenceCues:
+def evidence_cues(explained: Explanation, *, focal_px: float) -> EvidenceCues:
     """The cues of one pair.
 
     Args:
-        reconstructed: at the source image's size.
-        predicted: what it was reconstructed with.
-        view: that the prediction is of.
+        explained: at the source image's size.
         focal_px: that the network takes the view for.
     """
-    source, inside = _padded(reconstructed.source), _padded(reconstructed.inside.astype(np.uint8), outside=True)
-    rebuilt = _padded(np.clip(np.rint(reconstructed.reconstruction), 0, 255).astype(np.uint8))
+    predicted, view = explained.predicted, explained.model_input.view
+    source, inside = _padded(explained.source), _padded(explained.inside.astype(np.uint8), outside=True)
+    rebuilt = _padded(np.clip(np.rint(explained.reconstruction), 0, 255).astype(np.uint8))
     np.copyto(rebuilt, source, where=inside == 0)
     height, width = source.shape
     photometric = np.empty((len(PHOTOMETRIC_CUES), height, width), dtype=np.float32)
     difference = np.asarray(cv2.subtract(rebuilt, source, dtype=cv2.CV_32F), dtype=np.float32)
     _bound(difference, HALF_GRAY, photometric[0])
-    _bound(_padded(reconstructed.normalised, outside=True), HALF_NORMALISED_GRAY, photometric[1])
-    _bound(_padded(reconstructed.half_range), HALF_GRAY, photometric[2])
+    _bound(_padded(explained.normalised, outside=True), HALF_NORMALISED_GRAY, photometric[1])
+    _bound(_padded(explained.half_range), HALF_GRAY, photometric[2])
 
     blocks = (width // EVIDENCE_BLOCK_PX, height // EVIDENCE_BLOCK_PX)
     geometric = np.empty((len(GEOMETRIC_CUES), *blocks[::-1]), dtype=np.float32)

@@ -135,7 +135,14 @@ def test_a_rival_is_cut_at_every_threshold_with_the_papers_rule(two: FramePair) 
 def test_the_plain_residual_is_the_papers_whatever_is_configured(detector: AnomalyDetector, two: FramePair) -> None:
     fancy = DetectorConfig(photometric_compensation=True, residual="minimum")
     judged = [plain_residual(detector.with_config(config)).judge(two) for config in (fancy, DetectorConfig())]
-    off = DetectorConfig.model_validate({"correction": {"enabled": False}, "regions": {"texture_softening_gray": 0}})
+    off = DetectorConfig.model_validate(
+        {
+            "evidence": "residual",
+            "photometric_compensation": False,
+            "correction": {"enabled": False},
+            "regions": {"texture_softening_gray": 0},
+        }
+    )
     paper = DetectorMethod("paper", detector.with_config(off)).judge(two)
     for judgement in judged:
         assert judgement is not None

@@ -152,3 +152,23 @@ def test_parts_add_up() -> None:
     merged = scored(frames[0])
     merged.merge(scored(frames[1]))
     assert merged.summary() == scored(*frames).summary()
+
+
+def test_reliability_compares_scores_with_what_moves() -> None:
+    scores = DetectionScores()
+    mover = TrueObject(BoundingBox(0, 0, 10, 10), 5.0, counted=True)
+    for hit in (True, True, True, False):  # three of four regions that score 0.8 find the mover
+        scores.add_frame([box(0 if hit else 50, 0, 10, 10, 0.8)], Labels((mover,)), 0.1)
+    scores.add_frame([box(50, 0, 10, 10, 1.0)], Labels(()), 0.1)
+    low, high = scores.reliability()
+    assert (low.regions, low.mean_score, low.share_moving) == (4, pytest.approx(0.8), 0.75)
+    assert (high.low, high.high, high.regions, high.share_moving) == (0.9, 1.0, 1, 0.0)
+    assert scores.calibration_error() == pytest.approx((4 * 0.05 + 1 * 1.0) / 5)
+    assert DetectionScores().calibration_error() is None
+    assert DetectionScores().reliability() == []
+
+
+def test_the_label_decides_what_is_an_alarm() -> None:
+    scores = DetectionScores()
+    scores.add_frame([ScoredBox(BoundingBox(0, 0, 10, 10), 0.9, motion=False)], Labels(()), 0.1)
+    assert scores.alarms() == 0

@@ -1,0 +1,72 @@
+"""What regions are found in: the evidence head's probabilities of motion, or the residual alone (the paper's)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from viflow_anomaly.checkpoint_record import EvidenceRecord
+from viflow_anomaly.config import DetectorConfig
+from viflow_anomaly.errors import CheckpointError
+from viflow_anomaly.evidence_cues import GEOMETRIC_CUES, PHOTOMETRIC_CUES, EvidenceCues
+from viflow_anomaly.explanation import Explanation
+from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.moving_regions import MotionMaps, find_moving_regions
+from viflow_anomaly.regions import Region, find_regions
+from viflow_anomaly.runtime.loading import LoadedEvidence
+
+
+class JudgedCues(NamedTuple):
+    """What the evidence head was shown, and what it says."""
+
+    cues: EvidenceCues
+    maps: MotionMaps
+
+
+def require_our_cues(record: EvidenceRecord) -> None:
+    """A head must have learned from the cues of this version.
+
+    Raises:
+        CheckpointError: ``evidence_cues_differ``.
+    """
+    expected, found = (PHOTOMETRIC_CUES, GEOMETRIC_CUES), (record.photometric_cues, record.geometric_cues)
+    if expected != found:
+        raise CheckpointError(
+            f"evidence head {record.name} {record.version}: expected one that was trained on the cues {expected}, "
+            f"found {found}",
+            code="evidence_cues_differ",
+            field="evidence_head",
+        )
+
+
+def takes_head(head: LoadedEvidence | None, explanation: Explanation, config: DetectorConfig) -> bool:
+    """Whether the head judges this pair: "auto" wants a network that knows depth, as the head was trained on."""
+    if head is None or config.evidence == "residual":
+        return False
+    correction = explanation.predicted.correction
+    return config.evidence == "learned" or (correction is not None and correction.motion is not None)
+
+
+def judge_cues(head: LoadedEvidence, cues: EvidenceCues, explanation: Explanation) -> JudgedCues:
+    """The head's probabilities of one pair, at the source image's size."""
+    height, width = explanation.source.shape
+    logits = head.runtime.judge(*cues)[:, :height, :width]
+    return JudgedCues(cues, MotionMaps(*(_sigmoid(one) for one in logits)))
+
+
+def regions_of(
+    explanation: Explanation, judged: JudgedCues | None, head: LoadedEvidence | None, config: DetectorConfig
+) -> Sequence[Region]:
+    """All regions, highest score first; ``judged`` None: in the normalised residual."""
+    residual, inside = explanation.residual, explanation.inside
+    if judged is None or head is None:
+        return find_regions(explanation.normalised, inside, config.regions, residual=residual).regions
+    score = head.record.region_score
+    return find_moving_regions(judged.maps, judged.cues, inside, config.regions, residual=residual, score=score)
+
+
+def _sigmoid(logits: Float32Array) -> Float32Array:
+    """exp(80) is near the largest that float32 knows; beyond it the answer is the same."""
+    return np.asarray(1 / (1 + np.exp(-np.clip(logits, -80, 80))), dtype=np.float32)
