@@ -57,6 +57,8 @@ def load_bundled_or_configured(settings: ServiceSettings) -> PairDetector:
         device=settings.device,
         runtime=settings.runtime,
         threads=settings.threads,
+        evidence_head=settings.evidence_head,
+        precision=settings.precision,
     )
     return calibrated(detector, settings.calibration)
 

@@ -9,7 +9,15 @@ from typing import Any, Literal
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
 from pydantic_settings import BaseSettings, SettingsConfigDict, SettingsError
 
-from viflow_anomaly.config import MAX_THREADS, DetectorConfig, ImageLimits, RuntimeName, UsablePath, describe_validation
+from viflow_anomaly.config import (
+    MAX_THREADS,
+    DetectorConfig,
+    ImageLimits,
+    Precision,
+    RuntimeName,
+    UsablePath,
+    describe_validation,
+)
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.settings import refuse_unknown_variables
 
@@ -31,6 +39,10 @@ class ServiceSettings(BaseSettings):
     )
 
     checkpoint: UsablePath | None = Field(default=None, description="model to load; the bundled one when not given")
+    evidence_head: UsablePath | None = Field(default=None, description="head to load; the bundled one when not given")
+    precision: Precision = Field(
+        default="auto", description="of the evidence head: f32, or auto: bfloat16 where it can"
+    )
     calibration: UsablePath | None = Field(default=None, description="file of `viflow-anomaly calibrate`")
     device: str = "cpu"
     runtime: RuntimeName = Field(default="auto", description="torch, openvino, or auto: OpenVINO where it can run")

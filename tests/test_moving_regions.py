@@ -15,6 +15,7 @@ from viflow_anomaly.moving_regions import (
     find_moving_regions,
     measure_regions,
     probability_of,
+    sigmoid,
 )
 from viflow_anomaly.regions import Region
 
@@ -31,11 +32,11 @@ def cues(**values: float) -> EvidenceCues:
 
 
 def maps(*boxes: tuple[slice, slice], probability: float = 0.9, seam: tuple[slice, slice] | None = None) -> MotionMaps:
-    motion, seams = np.full(SHAPE, 0.02, np.float32), np.zeros(SHAPE, np.float32)
+    motion, seams = np.full(SHAPE, 0.02, np.float32), np.full(SHAPE, -5, np.float32)
     for box in boxes:
         motion[box] = probability
     if seam is not None:
-        seams[seam] = 0.9
+        seams[seam] = 2.0
     return MotionMaps(motion, seams)
 
 
@@ -128,3 +129,8 @@ def test_features_are_as_many_as_their_names_and_finite_at_the_ends() -> None:
         assert measured.features.shape == (len(REGION_FEATURES),)
         assert np.isfinite(measured.features).all()
         assert 0 <= probability_of(measured.features, RegionScore()) <= 1
+
+
+def test_the_sigmoid_knows_its_ends() -> None:
+    logits = np.array([[-500.0, -80.0, 0.0, 2.0, 80.0, 500.0]], np.float32)
+    np.testing.assert_allclose(sigmoid(logits), [[0, 0, 0.5, 1 / (1 + np.exp(-2)), 1, 1]], atol=1e-6)

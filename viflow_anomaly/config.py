@@ -243,6 +243,8 @@ class RegionConfig(FrozenConfig):
 
 
 MAX_THREADS = 1024
+Precision = Literal["auto", "f32"]
+"""Of the evidence head in OpenVINO: "auto" is bfloat16 on CPUs that compute in it."""
 RuntimeName = Literal["auto", "torch", "openvino"]
 """What runs the network: "auto" is OpenVINO on a CPU where it is installed and the checkpoint was exported."""
 

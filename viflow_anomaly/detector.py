@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viflow_anomaly.checkpoint_record import CheckpointRecord
-from viflow_anomaly.config import DetectorConfig, MotorSource, RuntimeName
+from viflow_anomaly.config import DetectorConfig, MotorSource, Precision, RuntimeName
 from viflow_anomaly.detection import (
     AnalyzedRegion,
     Detection,
@@ -125,6 +125,7 @@ class AnomalyDetector:
         threads: int | None = None,
         evidence_head: Path | None = None,
         with_evidence: bool = True,
+        precision: Precision = "auto",
     ) -> Self:
         """Load a checkpoint (None: the bundled model) and an evidence head.
 
@@ -136,6 +137,7 @@ class AnomalyDetector:
             threads: CPU threads of the network (torch: of the whole process); None: torch's own, one in OpenVINO.
             evidence_head: a ``.safetensors`` file likewise; None: the bundled one.
             with_evidence: False: none is loaded, and regions are found in the residual.
+            precision: of the evidence head in OpenVINO; "f32" answers as torch does.
 
         Raises:
             CheckpointError: as ``load_runtime``; ``evidence_cues_differ`` for a head of other cues than this version's.
@@ -144,7 +146,9 @@ class AnomalyDetector:
         loaded, record = load_runtime(path, runtime=runtime, device=device, threads=threads)
         evidence = None
         if with_evidence:
-            evidence = load_evidence(evidence_head, runtime=runtime, device=device, threads=threads)
+            evidence = load_evidence(
+                evidence_head, runtime=runtime, device=device, threads=threads, precision=precision
+            )
             require_our_cues(evidence.record)
         return cls(loaded, record, config=config or DetectorConfig(), evidence=evidence)
 

@@ -12,8 +12,7 @@ from viflow_anomaly.config import DetectorConfig
 from viflow_anomaly.errors import CheckpointError
 from viflow_anomaly.evidence_cues import GEOMETRIC_CUES, PHOTOMETRIC_CUES, EvidenceCues
 from viflow_anomaly.explanation import Explanation
-from viflow_anomaly.geometry import Float32Array
-from viflow_anomaly.moving_regions import MotionMaps, find_moving_regions
+from viflow_anomaly.moving_regions import MotionMaps, find_moving_regions, sigmoid
 from viflow_anomaly.regions import Region, find_regions
 from viflow_anomaly.runtime.loading import LoadedEvidence
 
@@ -53,7 +52,7 @@ def judge_cues(head: LoadedEvidence, cues: EvidenceCues, explanation: Explanatio
     """The head's probabilities of one pair, at the source image's size."""
     height, width = explanation.source.shape
     logits = head.runtime.judge(*cues)[:, :height, :width]
-    return JudgedCues(cues, MotionMaps(*(_sigmoid(one) for one in logits)))
+    return JudgedCues(cues, MotionMaps(sigmoid(np.ascontiguousarray(logits[0])), logits[1]))
 
 
 def regions_of(
@@ -65,8 +64,3 @@ def regions_of(
         return find_regions(explanation.normalised, inside, config.regions, residual=residual).regions
     score = head.record.region_score
     return find_moving_regions(judged.maps, judged.cues, inside, config.regions, residual=residual, score=score)
-
-
-def _sigmoid(logits: Float32Array) -> Float32Array:
-    """exp(80) is near the largest that float32 knows; beyond it the answer is the same."""
-    return np.asarray(1 / (1 + np.exp(-np.clip(logits, -80, 80))), dtype=np.float32)

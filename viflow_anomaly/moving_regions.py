@@ -29,7 +29,8 @@ from viflow_anomaly.regions import (
 from viflow_anomaly.sensor_data import Float64Array
 from viflow_anomaly.shape_rule import Shape, judge_shape, thickness_px
 
-SEAM_PROBABILITY = 0.5
+SEAM_LOGIT = 0.0
+"""Where a seam is as likely as none."""
 SEAM_REACH_PX = 5
 """Pixels of a seam go to the component that is nearest, within so many pixels."""
 MAX_LOGIT = 8.0
@@ -56,10 +57,10 @@ _CUES = [GEOMETRIC_CUES.index(name) for name in CUE_FEATURES]
 
 
 class MotionMaps(NamedTuple):
-    """What the head says of every source pixel: probabilities [H, W] of motion and, where it moves, of a seam."""
+    """What the head says of every source pixel: [H, W] probability of motion, and logit of a seam where it moves."""
 
     motion: Float32Array
-    seam: Float32Array
+    seam_logit: Float32Array
 
 
 class MeasuredRegion(NamedTuple):
@@ -78,8 +79,13 @@ def measure_regions(
 ) -> list[MeasuredRegion]:
     """Connected regions that probably move, largest first; arguments as in ``find_moving_regions``."""
     mask = (maps.motion > config.min_motion_probability) & inside
-    y, x = pixels_of(mask)
-    components = largest_components(y, x, _labels(mask, maps.seam)[y, x], mask.size, config)
+    left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
+    if not width:
+        return []
+    part = (slice(top, top + height), slice(left, left + width))
+    y, x = pixels_of(mask[part])
+    labels = _labels(mask[part], maps.seam_logit[part])[y, x]
+    components = largest_components(y + top, x + left, labels, mask.size, config)
     limits = shape_limits(config, float(np.hypot(*mask.shape)))
     measured = []
     for component in components:
@@ -139,9 +145,9 @@ def _judge(measured: MeasuredRegion, residual: Float32Array, score: RegionScore,
     )
 
 
-def _labels(mask: BoolArray, seam: Float32Array) -> IndexArray:
+def _labels(mask: BoolArray, seam_logit: Float32Array) -> IndexArray:
     """[H, W] components (1..) of the mask, cut along seams; what is left of a seam joins no component."""
-    cut = mask & (seam > SEAM_PROBABILITY)
+    cut = mask & (seam_logit > SEAM_LOGIT)
     labels = np.asarray(label_components(mask & ~cut, connectivity=2))  # type: ignore[no-untyped-call]
     if not cut.any() or labels.max() > np.iinfo(np.uint16).max:
         return labels.astype(np.intp)
@@ -161,8 +167,14 @@ def _features(
     blocks = (y // EVIDENCE_BLOCK_PX, x // EVIDENCE_BLOCK_PX)
     means = [np.abs(cues.geometric[cue][blocks]).mean() for cue in _CUES]
     shares = (np.log(motion.size / maps.motion.size), motion.size / outline.size, min(shape.nearness_to_band, 2.0))
-    own = (_logit(motion.mean()), _logit(motion.max()), *shares, maps.seam[y, x].mean())
+    own = (_logit(motion.mean()), _logit(motion.max()), *shares, sigmoid(maps.seam_logit[y, x]).mean())
     return np.array([*own, *means], dtype=np.float64)
+
+
+def sigmoid(logits: Float32Array) -> Float32Array:
+    """1 / (1 + exp(-logits)); OpenCV's exponential, because numpy's takes ten times as long."""
+    grown = np.asarray(cv2.exp(-logits), dtype=np.float32).reshape(logits.shape)
+    return np.asarray(1 / (grown + np.float32(1)), dtype=np.float32)
 
 
 def _logit(probability: float) -> float:

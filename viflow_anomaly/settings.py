@@ -25,6 +25,7 @@ from viflow_anomaly.config import (
     FrozenConfig,
     ImageLimits,
     ModelConfig,
+    Precision,
     RigEstimateConfig,
     RuntimeName,
     TrackingConfig,
@@ -71,6 +72,7 @@ class Settings(FrozenConfig):
     device: str = "cpu"
     threads: int = Field(default=1, ge=1, le=MAX_THREADS)
     runtime: RuntimeName = "auto"
+    precision: Precision = "auto"
     limits: ImageLimits = ImageLimits()
     detector: DetectorConfig = DetectorConfig()
     tracking: TrackingConfig = TrackingConfig()

@@ -72,6 +72,7 @@ def load_detector(settings: Settings, *, evidence: bool = True) -> AnomalyDetect
         runtime=settings.runtime,
         threads=settings.threads,
         evidence_head=settings.evidence_head,
+        precision=settings.precision,
         with_evidence=evidence,
     )
     return calibrated(detector, settings.calibration)

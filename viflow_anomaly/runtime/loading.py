@@ -14,7 +14,7 @@ from viflow_anomaly.checkpoint_record import (
     read_checkpoint,
     read_tensors,
 )
-from viflow_anomaly.config import RuntimeName
+from viflow_anomaly.config import Precision, RuntimeName
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.runtime.interface import EvidenceRuntime, Runtime
 
@@ -61,16 +61,26 @@ def load_runtime(
 
 
 def load_evidence(
-    path: Path | None, *, runtime: RuntimeName = "auto", device: str = "cpu", threads: int | None = None
+    path: Path | None,
+    *,
+    runtime: RuntimeName = "auto",
+    device: str = "cpu",
+    threads: int | None = None,
+    precision: Precision = "auto",
 ) -> LoadedEvidence:
-    """Load an evidence head (None: the bundled one); arguments and errors as ``load_runtime``."""
+    """Load an evidence head (None: the bundled one); arguments and errors as ``load_runtime``.
+
+    ``precision`` is OpenVINO's; torch computes in float32 on a CPU.
+    """
     path = bundled_evidence_head() if path is None else path
     if not _takes_openvino(path, runtime, device):
         return _torch_evidence(path, device)
     from viflow_anomaly.runtime.openvino_evidence import OpenvinoEvidence  # noqa: PLC0415
 
     _, record = read_tensors(path, EvidenceRecord)
-    return LoadedEvidence(OpenvinoEvidence(path.with_suffix(".onnx"), record, threads=threads or 1), record)
+    return LoadedEvidence(
+        OpenvinoEvidence(path.with_suffix(".onnx"), record, threads=threads or 1, precision=precision), record
+    )
 
 
 def _takes_openvino(path: Path, runtime: RuntimeName, device: str) -> bool:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from viflow_anomaly.checkpoint_record import EvidenceRecord, corrupt_checkpoint
-from viflow_anomaly.config import EVIDENCE_BLOCK_PX
+from viflow_anomaly.config import EVIDENCE_BLOCK_PX, Precision
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.runtime.exported import HEAD_KEY
 from viflow_anomaly.runtime.openvino_network import OpenvinoNetwork, Size
@@ -16,14 +16,14 @@ from viflow_anomaly.runtime.openvino_network import OpenvinoNetwork, Size
 class OpenvinoEvidence:
     """Runs the head's ``NAME.onnx``; arguments and errors as ``OpenvinoNetwork``."""
 
-    def __init__(self, path: Path, record: EvidenceRecord, *, threads: int = 1) -> None:
+    def __init__(self, path: Path, record: EvidenceRecord, *, threads: int = 1, precision: Precision = "auto") -> None:
         counts = (len(record.photometric_cues), len(record.geometric_cues))
 
         def shapes(size: Size) -> dict[str, list[int]]:
             blocks = [side // EVIDENCE_BLOCK_PX for side in size]
             return {"photometric": [1, counts[0], *size], "geometric": [1, counts[1], *blocks]}
 
-        self._network = OpenvinoNetwork(path, record, shapes=shapes, threads=threads)
+        self._network = OpenvinoNetwork(path, record, shapes=shapes, threads=threads, precision=precision)
         if HEAD_KEY not in self._network.metadata:
             raise corrupt_checkpoint(path, "expected the export of an evidence head, found another network's")
 

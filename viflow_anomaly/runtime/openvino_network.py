@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Self
 import openvino
 
 from viflow_anomaly.checkpoint_record import TensorRecord, corrupt_checkpoint, read_checkpoint_file
+from viflow_anomaly.config import Precision
 from viflow_anomaly.errors import CheckpointError
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.runtime.exported import exported_metadata
@@ -59,13 +60,20 @@ class OpenvinoNetwork:
         record: of the checkpoint that it must have been exported from.
         shapes: of the inputs that depend on the size (height, width) of what is seen.
         threads: of one prediction.
+        precision: "auto" computes in bfloat16 where the CPU has it.
 
     Raises:
         CheckpointError: ``export_stale``: altered, or the checkpoint was replaced after it; ``checkpoint_corrupt``.
     """
 
     def __init__(
-        self, path: Path, record: TensorRecord, *, shapes: Callable[[Size], dict[str, list[int]]], threads: int
+        self,
+        path: Path,
+        record: TensorRecord,
+        *,
+        shapes: Callable[[Size], dict[str, list[int]]],
+        threads: int,
+        precision: Precision = "f32",
     ) -> None:
         data = read_checkpoint_file(path)
         _require_fresh(path, data, record)
@@ -79,6 +87,8 @@ class OpenvinoNetwork:
         self._data = data
         self._shapes = shapes
         self._threads = threads
+        has_bfloat16 = "BF16" in self._core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+        self._precision = "bf16" if precision == "auto" and has_bfloat16 else "f32"
         self._compiled: dict[Size, Any] = {}
         self._lock = threading.Lock()
         self._requests = threading.local()
@@ -103,7 +113,7 @@ class OpenvinoNetwork:
                     model,
                     "CPU",
                     {
-                        "INFERENCE_PRECISION_HINT": "f32",  # the default is bfloat16 where the CPU has it
+                        "INFERENCE_PRECISION_HINT": self._precision,
                         "INFERENCE_NUM_THREADS": self._threads,
                         "NUM_STREAMS": 0,  # in the caller's thread: no hand-over, and callers run side by side
                         "ENABLE_CPU_PINNING": False,
