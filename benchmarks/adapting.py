@@ -65,7 +65,12 @@ FLIGHT_BLOCKS = {"rule": "blocks", "block_s": 0.5, "test_share": 0.34}
 DRIVE_BLOCKS = {"rule": "blocks", "block_s": 1.0, "test_share": 0.2}
 MEASURES = ("photometric", "lidar_flow", "regions", "simulated")
 REGION_FIGURES = ("frames", "movers", "roi_ap", "best_f1", "recall_at_0.1_false_alarms", "false_alarms_per_frame")
+START = "start"
 OFFSETS_S = (0.0, 0.03, 0.06, 0.09)
+
+
+Named = dict[str, Path]
+"""Checkpoints by the name that the report calls them."""
 
 
 class Adaptation(NamedTuple):
@@ -199,42 +204,45 @@ def asked(*arguments: object) -> dict[str, Any]:
     return report
 
 
-def flow_of(checkpoint: Path, *arguments: object) -> dict[str, Any]:
-    """Endpoint error and its ratio to no motion's, by group, as ``evaluate flow`` finds them."""
-    report = asked("evaluate", "flow", *arguments, "--checkpoint", f"it={checkpoint}", "--methods", "identity")
-    found = {}
-    for group, methods in report["groups"].items():
-        rows = {"predicted": methods["it"], "corrected": methods[f"it{CORRECTED}"]}
-        found[group] = {
-            name: {"epe_px": round(row["epe_mean_px"], 3), "ratio": round(row["epe_ratio"], 4)}
-            for name, row in rows.items()
+def flow_figures(named: Named, *arguments: object) -> dict[str, Any]:
+    """Endpoint error and its ratio to no motion's of every checkpoint, by group, as ``evaluate flow`` finds them."""
+    chosen = [part for name, path in named.items() for part in ("--checkpoint", f"{name}={path}")]
+    report = asked("evaluate", "flow", *arguments, *chosen, "--methods", "identity")
+    return {
+        group: {
+            name: {
+                key: {"epe_px": round(row["epe_mean_px"], 3), "ratio": round(row["epe_ratio"], 4)}
+                for key, row in (("predicted", methods[name]), ("corrected", methods[name + CORRECTED]))
+            }
+            for name in named
         }
+        for group, methods in report["groups"].items()
+    }
+
+
+def simulated(named: Named, held_out: Path) -> dict[str, Any]:
+    """Held-out simulated sequences, by rig."""
+    return flow_figures(named, *sorted(held_out.iterdir()), "--max-pairs", MAX_SIMULATED_PAIRS)
+
+
+def lidar_flow(named: Named, real: Path, truth: Path) -> dict[str, Any]:
+    """The drives with scans."""
+    found = {}
+    for drive in LIDAR_DRIVES:
+        call(command("groundtruth", "kitti", real / PLACES[drive], "--out", truth / drive))
+        (found[drive],) = flow_figures(named, real / PLACES[drive], "--ground-truth", truth / drive).values()
     return found
 
 
-def simulated(checkpoint: Path, held_out: Path) -> dict[str, Any]:
-    """Held-out simulated sequences, by rig."""
-    return flow_of(checkpoint, *sorted(held_out.iterdir()), "--max-pairs", MAX_SIMULATED_PAIRS)
-
-
-def measured(checkpoint: Path, real: Path, truth: Path, held_out: Path, only: Sequence[str]) -> dict[str, Any]:
-    """Everything of one checkpoint."""
-    found: dict[str, Any] = {"sha256": read_checkpoint(checkpoint)[1].sha256}
-    if "photometric" in only:
-        found["photometric"] = photometric_all(checkpoint, real)
-    if "lidar_flow" in only:
-        found["lidar_flow"] = {}
-        for drive in LIDAR_DRIVES:
-            (found["lidar_flow"][drive],) = flow_of(
-                checkpoint, real / PLACES[drive], "--ground-truth", truth / drive
-            ).values()
-    if "regions" in only:
-        found["regions"] = {}
+def regions(named: Named, real: Path) -> dict[str, Any]:
+    """The drives with labels; of each checkpoint its detector at the default settings."""
+    drives = [real / PLACES[drive] for drive in LABELLED_DRIVES]
+    found: dict[str, Any] = {drive: {} for drive in LABELLED_DRIVES}
+    for name, checkpoint in named.items():
+        report = asked("evaluate", "detect", *drives, "--no-rivals", "--checkpoint", checkpoint)
         for drive in LABELLED_DRIVES:
-            report = asked("evaluate", "detect", real / PLACES[drive], "--no-rivals", "--checkpoint", checkpoint)
-            found["regions"][drive] = {key: report["all"][OURS][key] for key in REGION_FIGURES}
-    if "simulated" in only:
-        found["simulated"] = simulated(checkpoint, held_out)
+            figures = report["sequences"][drive]["methods"][OURS]
+            found[drive][name] = {key: figures[key] for key in REGION_FIGURES}
     return found
 
 
@@ -242,73 +250,81 @@ def rate_study(rates: Sequence[float], real: Path, runs: Path, held_out: Path, i
     """Learning rates by what their trainings left out, and by what they forget."""
     found: dict[str, Any] = {}
     for adaptation in RATE_STUDY:
-        checkpoints = {"start": start}
+        named = {START: start}
         for rate in rates:
             folder = runs / "rates" / f"{adaptation.name}-{rate:g}"
-            checkpoints[f"{rate:g}"] = trained(adaptation, real, folder, init, {"training.learning_rate": rate})
-        found[adaptation.name] = {
-            rate: {
-                "photometric": photometric_kept(checkpoint, adaptation, real),
-                "simulated": simulated(checkpoint, held_out),
-            }
-            for rate, checkpoint in checkpoints.items()
-        }
+            named[f"{rate:g}"] = trained(adaptation, real, folder, init, {"training.learning_rate": rate})
+        kept = {name: photometric_kept(checkpoint, adaptation, real) for name, checkpoint in named.items()}
+        found[adaptation.name] = {"kept": kept, "simulated": simulated(named, held_out)}
     return found
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--real-data", type=Path, default=ROOT / ".." / "shared" / "data", help="euroc/ and kitti/")
+    parser.add_argument(
+        "--real-data",
+        type=Path,
+        default=Path(os.environ.get("VIFLOW_REAL_DATA", ROOT / ".." / "shared" / "data")),
+        help="holds euroc/ and kitti/ (default: VIFLOW_REAL_DATA)",
+    )
     parser.add_argument("--held-out", type=Path, required=True, help="simulated sequences (make held-out)")
     parser.add_argument("--runs", type=Path, required=True, help="where trainings are kept; outside the source tree")
     parser.add_argument("--init", default="default", help="checkpoint to start from (default: the bundled one)")
     parser.add_argument("--rates", help="learning rates to compare, 1e-4,3e-4,...")
     parser.add_argument("--only", default=",".join(MEASURES), help="measures, with commas between (default: all)")
+    parser.add_argument("--adaptations", default=",".join(one.name for one in ADAPTATIONS), help="(default: all)")
     parser.add_argument("--out", type=Path, default=RESULTS)
     arguments = parser.parse_args()
-    only = arguments.only.split(",")
-    if unknown := sorted(set(only) - set(MEASURES)):
-        parser.error(f"--only: expected some of {','.join(MEASURES)}, found {','.join(unknown)}")
+    only = _some_of(MEASURES, arguments.only, parser, "--only")
+    names = _some_of([one.name for one in ADAPTATIONS], arguments.adaptations, parser, "--adaptations")
+    chosen = [one for one in ADAPTATIONS if one.name in names]
     cv2.setNumThreads(1)
-    real, runs = arguments.real_data, arguments.runs
+    real, runs, held_out = arguments.real_data, arguments.runs, arguments.held_out
     start = bundled_checkpoint() if arguments.init == "default" else Path(arguments.init)
-    report = _report_to_add_to(arguments.out, read_checkpoint(start)[1].sha256)
+    report = json.loads(arguments.out.read_text(encoding="utf-8")) if arguments.out.exists() else {}
 
-    def write(key: str, values: dict[str, Any]) -> None:
+    def write(key: str, values: object) -> None:
         # After each part: an hour of measuring is not lost to the last one's failure.
-        report[key] = {**report.get(key, {}), **values}
+        report[key] = {**circumstances(), "found": values}
         write_atomically(arguments.out, (json.dumps(report, indent=2) + "\n").encode())
 
     if arguments.rates is not None:
         rates = [float(text) for text in arguments.rates.split(",")]
-        write("rates", rate_study(rates, real, runs, arguments.held_out, arguments.init, start))
-        write("measured", {"rates": circumstances()})
-    for drive in LIDAR_DRIVES if "lidar_flow" in only else ():
-        call(command("groundtruth", "kitti", real / PLACES[drive], "--out", runs / "truth" / drive))
+        write("rates", rate_study(rates, real, runs, held_out, arguments.init, start))
+    named = {START: start}
+    for adaptation in chosen:
+        named[adaptation.name] = trained(adaptation, real, runs / adaptation.name, arguments.init, {})
+    write("checkpoints", {name: about(path) for name, path in named.items()})
     if "photometric" in only:
+        write("photometric", {name: photometric_all(path, real) for name, path in named.items()})
+        kept = {}
+        for adaptation in chosen:
+            pair = {"before": start, "after": named[adaptation.name]}
+            kept[adaptation.name] = {key: photometric_kept(path, adaptation, real) for key, path in pair.items()}
+        write("kept", kept)
         write("time_offset_s", time_offsets(start, real))
-    write("start", measured(start, real, runs / "truth", arguments.held_out, only))
-    for adaptation in ADAPTATIONS:
-        checkpoint = trained(adaptation, real, runs / adaptation.name, arguments.init, {})
-        figures = measured(checkpoint, real, runs / "truth", arguments.held_out, only)
-        if "photometric" in only:
-            kept = {"before": start, "after": checkpoint}
-            figures["kept"] = {name: photometric_kept(one, adaptation, real) for name, one in kept.items()}
-        provenance = read_checkpoint(checkpoint)[1].provenance
-        about = {
-            "recordings": adaptation.recordings,
-            "pairs": provenance["data"]["pairs"],
-            **{key: provenance[key] for key in ("init", "training")},
-        }
-        earlier = report.get("adapted", {}).get(adaptation.name, {})
-        write("adapted", {adaptation.name: {**earlier, **about, **figures}})
-    write("measured", {measure: circumstances() for measure in only})
+    if "lidar_flow" in only:
+        write("lidar_flow", lidar_flow(named, real, runs / "truth"))
+    if "regions" in only:
+        write("regions", regions(named, real))
+    if "simulated" in only:
+        write("simulated", simulated(named, held_out))
 
 
-def _report_to_add_to(path: Path, start_sha256: str) -> dict[str, Any]:
-    """The last report, whose other measures stay (``--only``); a new one where that began at another checkpoint."""
-    report: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    return report if report.get("start", {}).get("sha256") == start_sha256 else {"start": {"sha256": start_sha256}}
+def about(checkpoint: Path) -> dict[str, Any]:
+    """Which checkpoint it is, and what it learnt from; of one that began from fresh weights only the former."""
+    record = read_checkpoint(checkpoint)[1]
+    found: dict[str, Any] = {"name": record.name, "version": record.version, "sha256": record.sha256}
+    if "init" in record.provenance:
+        found |= {key: record.provenance[key] for key in ("init", "training", "data")}
+    return found
+
+
+def _some_of(known: Sequence[str], text: str, parser: argparse.ArgumentParser, option: str) -> list[str]:
+    found = text.split(",")
+    if unknown := sorted(set(found) - set(known)):
+        parser.error(f"{option}: expected some of {','.join(known)}, found {','.join(unknown)}")
+    return found
 
 
 if __name__ == "__main__":
