@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 from simulated_truth import add_ground_truth
-from worlds import make_world, write_plain
+from worlds import REAL_DATA, make_world, write_plain
 
 from viflow_anomaly.checkpoint import load_checkpoint, load_training_state, save_checkpoint
 from viflow_anomaly.checkpoint_record import CheckpointRecord, bundled_checkpoint
@@ -360,3 +360,12 @@ def test_defaults_are_below_every_other_layer(tmp_path: Path) -> None:
     assert settings.training.learning_rate == 0.5
     assert settings.training.steps == FINE_TUNING_DEFAULTS["steps"]
     assert settings.training.batch_size == TrainingConfig().batch_size
+
+
+def test_a_real_flight_without_labels_is_adapted_to(tmp_path: Path) -> None:
+    flight = REAL_DATA / "euroc" / "V1_01_easy"
+    if not flight.is_dir():
+        pytest.skip(f"no real data at {flight}; set VIFLOW_REAL_DATA to the folder that holds it")
+    short = TRAINING.model_copy(update={"steps": 1, "look_aheads": (1,)})
+    record = load_checkpoint(fit(flight, tmp_path / "run", init=bundled_checkpoint(), training=short)).record
+    assert record.provenance["data"] == {"recordings": 1, "names": ["V1_01_easy"], "pairs": 59, "excluded": {}}
