@@ -468,3 +468,8 @@ class TrainingConfig(FrozenConfig):
         if not self.look_aheads or not all(1 <= step <= 4 for step in self.look_aheads):
             raise ValueError(f"look_aheads: expected steps between 1 and 4, found {list(self.look_aheads)}")
         return self
+
+
+FINE_TUNING_DEFAULTS = {"steps": 1000, "learning_rate": 3e-4, "warmup_steps": 100}
+"""What a training that starts from a checkpoint has instead of ``TrainingConfig``'s defaults: it is near its goal, and
+its recordings are few."""

@@ -89,6 +89,7 @@ def resolve_settings(
     environment: Mapping[str, str],
     assignments: Iterable[str] = (),
     options: Mapping[str, Any] | None = None,
+    defaults: Mapping[str, Any] | None = None,
 ) -> Settings:
     """Merge the layers, lowest first, validating after each.
 
@@ -97,12 +98,13 @@ def resolve_settings(
         environment: usually ``os.environ``.
         assignments: ``section.key=value`` from the command line (``--set``).
         options: dotted key -> value from dedicated command line options; None means "not given".
+        defaults: dotted key -> value instead of a default in the code, below every other layer.
 
     Raises:
         ConfigError: ``config_invalid``, ``config_unreadable``, ``config_format_unknown``, ``assignment_invalid``.
     """
     given = {key: value for key, value in (options or {}).items() if value is not None}
-    layers: list[tuple[str, Values]] = []
+    layers = [("defaults", nested((key.split("."), value) for key, value in (defaults or {}).items()))]
     if config_file is not None:
         layers.append((str(config_file), read_config_file(config_file)))
     layers.append(("environment", environment_values(environment)))

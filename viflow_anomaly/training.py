@@ -30,18 +30,29 @@ from viflow_anomaly.model.outputs import ViflowOutput
 from viflow_anomaly.rigid_losses import corrected_loss
 from viflow_anomaly.runtime.torch_runtime import TorchRuntime
 from viflow_anomaly.training_data import TrainingData, load_training_data
+from viflow_anomaly.training_init import read_initial_weights
 from viflow_anomaly.training_progress import TrainingProgress
 
 
 class TrainingRun:
     """Network, optimiser and step counter of one run, and their exact way to disk and back."""
 
-    def __init__(self, *, model: ModelConfig, training: TrainingConfig, device: str) -> None:
+    def __init__(
+        self,
+        *,
+        model: ModelConfig,
+        training: TrainingConfig,
+        device: str,
+        weights: Mapping[str, torch.Tensor] | None = None,
+    ) -> None:
         self.model_config = model
         self.config = training
         self.loss = _loss_name(model, training)
         self.device = device
-        network = build_model(model, seed=training.seed).to(device)
+        network = build_model(model, seed=training.seed)
+        if weights is not None:
+            network.load_state_dict(weights)
+        network = network.to(device)
         self.network: nn.Module = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), lr=training.learning_rate, weight_decay=training.weight_decay
@@ -189,6 +200,7 @@ def train(
     *,
     model: ModelConfig,
     training: TrainingConfig,
+    init: Path | None = None,
     validation: Sequence[Path] = (),
     device: str = "cpu",
     resume: bool = False,
@@ -200,6 +212,8 @@ def train(
         data: recordings to learn from, in any order: they are taken by name.
         out_dir: gets ``state.safetensors`` (exact, for resuming), ``model.safetensors`` + ``model.json``,
             ``metrics.jsonl`` and TensorBoard's ``events.*``.
+        init: the tensor file of a checkpoint to start from. The model is the checkpoint's, its fitted motor stream
+            too; what is set in ``model`` must agree with it.
         validation: recordings with ground truth to measure on, never to learn from.
         resume: go on from ``out_dir``; a fresh directory starts anew.
 
@@ -208,16 +222,19 @@ def train(
 
     Raises:
         ConfigError: ``training_exists``, ``resume_config_differs``, ``device_unavailable``, ``config_invalid`` (a loss
-            that does not fit the model).
+            that does not fit the model), ``init_model_differs``.
         DatasetError: as ``load_training_data`` and, before anything is learnt, ``require_ground_truth``.
-        CheckpointError: ``checkpoint_corrupt`` for the state to go on from.
+        CheckpointError: ``checkpoint_corrupt`` for the state to go on from; as ``load_checkpoint`` for ``init``.
     """
     require_device(device)
+    initial = None if init is None else read_initial_weights(init, model)
+    model = model if initial is None else initial.model
     loss = _loss_name(model, training)
     require_ground_truth(validation, model)
     torch.set_num_threads(training.threads)
     data = sorted(data, key=lambda path: (path.name, path))  # what a step draws depends on their order
     fingerprint = {
+        "init": None if initial is None else initial.origin["sha256"],
         "model": model.model_dump(mode="json"),
         "training": training.model_dump(mode="json"),
         "recordings": [path.name for path in data],
@@ -234,15 +251,19 @@ def train(
             split=training.split,
             on_progress=reporter.loading,
         )
-        run = TrainingRun(model=training_data.model, training=training, device=device)
+        weights = None if initial is None else initial.weights
+        run = TrainingRun(model=training_data.model, training=training, device=device, weights=weights)
         if resume:
             run.restore(out_dir, fingerprint)
+        if initial is not None and validation and run.step == 0:
+            reporter.validated(0, _validate(run, validation).summary())
         errors = _run_steps(run, training_data, validation, out_dir, fingerprint, reporter)
     provenance = {
         "package_version": __version__,
         "commit": source_commit(),
         "torch_version": torch.__version__,
         "device": device,
+        **({} if initial is None else {"init": initial.origin}),
         "training": fingerprint["training"],
         "data": {
             "recordings": len(data),

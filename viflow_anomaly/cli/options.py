@@ -40,16 +40,25 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on stdout, and 
 
 
 def settings_from(
-    config: Path | None, assignments: Sequence[str] | None, options: Mapping[str, Any] | None = None
+    config: Path | None,
+    assignments: Sequence[str] | None,
+    options: Mapping[str, Any] | None = None,
+    defaults: Mapping[str, Any] | None = None,
 ) -> Settings:
-    """Command line > environment (``VIFLOW_*``) > file > defaults.
+    """Command line > environment (``VIFLOW_*``) > file > ``defaults`` > defaults in the code.
 
     Raises:
         ConfigError: see ``resolve_settings``.
     """
     from viflow_anomaly.settings import resolve_settings
 
-    return resolve_settings(config_file=config, environment=os.environ, assignments=assignments or (), options=options)
+    return resolve_settings(
+        config_file=config,
+        environment=os.environ,
+        assignments=assignments or (),
+        options=options,
+        defaults=defaults,
+    )
 
 
 def load_detector(settings: Settings, *, evidence: bool = True) -> AnomalyDetector:

@@ -9,11 +9,23 @@ from typing import Annotated
 import typer
 
 from viflow_anomaly.cli.options import Assignments, ConfigFile, Device, settings_from
+from viflow_anomaly.config import FINE_TUNING_DEFAULTS
+
+BUNDLED = Path("default")
+FINE_TUNING = ", ".join(f"{key}={value:g}" for key, value in FINE_TUNING_DEFAULTS.items())
 
 
 def train(
     data: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Recordings to train on, any known layout.")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where checkpoints, logs and the final weights go.")],
+    init: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="default|PATH",
+            help="Start from a checkpoint's weights (default: the bundled model's) and take its model settings. Unless "
+            f"they are set, {FINE_TUNING}.",
+        ),
+    ] = None,
     validation: Annotated[
         list[Path] | None, typer.Option(metavar="DIR", help="A recording to measure on, never to train on. Repeatable.")
     ] = None,
@@ -39,6 +51,8 @@ def train(
 
       viflow-anomaly train runs/sim/drone_* --out runs/first --resume
 
+      viflow-anomaly train recordings/monday --init default --out runs/adapted
+
       viflow-anomaly train V1_01_easy/mav0 --out runs/paper --set model.preset=paper --set model.view.mode=center_crop
     """
     options = {
@@ -48,7 +62,9 @@ def train(
         "training.threads": threads,
         "device": device,
     }
-    settings = settings_from(config, assignments, options)
+    fine_tuning = {f"training.{key}": value for key, value in FINE_TUNING_DEFAULTS.items()}
+    settings = settings_from(config, assignments, options, defaults=None if init is None else fine_tuning)
+    from viflow_anomaly.checkpoint_record import bundled_checkpoint
     from viflow_anomaly.training import train as train_model
 
     checkpoint = train_model(
@@ -56,6 +72,7 @@ def train(
         out,
         model=settings.model,
         training=settings.training,
+        init=bundled_checkpoint() if init == BUNDLED else init,
         validation=validation or [],
         device=settings.device,
         resume=resume,

@@ -1,0 +1,61 @@
+"""What a training starts from instead of fresh weights: a checkpoint's tensors and its whole model configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from viflow_anomaly.checkpoint import load_checkpoint
+from viflow_anomaly.config import FrozenConfig, ModelConfig
+from viflow_anomaly.errors import ConfigError
+
+
+class InitialWeights(NamedTuple):
+    """A checkpoint to go on from.
+
+    Attributes:
+        weights: the network's state, on the CPU.
+        model: its configuration, the motor stream as it was fitted.
+        origin: name, version and sha256, for the provenance of what comes of it.
+    """
+
+    weights: Mapping[str, torch.Tensor]
+    model: ModelConfig
+    origin: dict[str, Any]
+
+
+def read_initial_weights(path: Path, asked: ModelConfig) -> InitialWeights:
+    """The checkpoint to start from.
+
+    Args:
+        path: its tensor file.
+        asked: what was asked for; only what was set in it counts, its defaults contradict nothing.
+
+    Raises:
+        CheckpointError: as ``load_checkpoint``.
+        ConfigError: ``init_model_differs``: a setting of ``asked`` is not the checkpoint's.
+    """
+    network, record = load_checkpoint(path)
+    differing = list(_differing("model", asked, record.model))
+    if differing:
+        raise ConfigError(
+            f"{path}: with --init expected the checkpoint's own model settings, or none, found "
+            + "; ".join(f"{key}: {asked_for!r}, but the checkpoint has {has!r}" for key, asked_for, has in differing),
+            code="init_model_differs",
+            field=differing[0][0],
+        )
+    origin = {"name": record.name, "version": record.version, "sha256": record.sha256}
+    return InitialWeights(network.state_dict(), record.model, origin)
+
+
+def _differing(name: str, asked: FrozenConfig, has: FrozenConfig) -> Iterator[tuple[str, object, object]]:
+    """Each setting that was set in ``asked`` and is another in ``has``: its dotted name and both values."""
+    for key in sorted(asked.model_fields_set):
+        wanted, found = getattr(asked, key), getattr(has, key)
+        if isinstance(wanted, FrozenConfig):
+            yield from _differing(f"{name}.{key}", wanted, found)
+        elif wanted != found:
+            yield f"{name}.{key}", wanted, found
