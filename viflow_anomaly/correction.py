@@ -132,6 +132,7 @@ def correct_motion(
     confidence = measured.confidence[thin].reshape(-1)
     prior = _prior(config)
     motion, turned = start, np.zeros(3)
+    turn: MeasuredTurn | None = None
     jacobian = np.zeros((2, 6, x.size), dtype=np.float32)
     for round_ in range(config.rounds):
         moved_x, moved_y, nearness = _moved(x, y, depth, motion)
@@ -139,7 +140,8 @@ def correct_motion(
         weights = robust_weights(error, confidence, _tolerance(config, round_) / focal_px)
         _fill_jacobian(jacobian, moved_x, moved_y, nearness)
         equations = _normal_equations(jacobian, error, weights)
-        turn = _measured_turn(equations, prior, turned)
+        if round_ == config.rounds - 1:
+            turn = _measured_turn(equations, prior, turned)
         step = _solved(equations, prior, _pull(prior, turned))
         turned = turned + step[:3]
         motion = RigidMotion(so3_exp(step[:3]) @ motion.rotation, motion.translation + step[3:])

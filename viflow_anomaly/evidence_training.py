@@ -16,11 +16,11 @@ from torch import nn
 
 from viflow_anomaly.checkpoint import load_training_state, save_training_state
 from viflow_anomaly.config import EvidenceTrainingConfig
-from viflow_anomaly.errors import CheckpointError, ConfigError
+from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.evidence_data import IGNORED, MOVING, SEAM, EvidenceBatch, EvidenceData
 from viflow_anomaly.model.evidence_builder import build_evidence_head
 from viflow_anomaly.model.evidence_head import EvidenceHead
-from viflow_anomaly.training_state import require_same_run, restore_state, state_tensors
+from viflow_anomaly.training_state import reached_step, require_same_run, restore_state, state_tensors
 
 Fingerprint = dict[str, object]
 
@@ -93,12 +93,7 @@ class EvidenceTraining:
         tensors, record = loaded
         require_same_run(folder, record, fingerprint)
         restore_state(self.network, self.optimizer, tensors, folder)
-        step = record.get("step")
-        if not isinstance(step, int):
-            raise CheckpointError(
-                f"{folder}: expected the step that was reached, found {step!r}", code="checkpoint_corrupt", field="out"
-            )
-        self.step = step
+        self.step = reached_step(record, folder)
         return True
 
 

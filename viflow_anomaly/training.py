@@ -6,9 +6,7 @@ gives the weights of an uninterrupted one (on a CPU, with the same number of thr
 
 from __future__ import annotations
 
-import json
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,7 @@ from viflow_anomaly.batch import Batch, require_device
 from viflow_anomaly.checkpoint import load_training_state, save_checkpoint, save_training_state
 from viflow_anomaly.checkpoint_record import source_commit
 from viflow_anomaly.config import ModelConfig, MotorConfig, TrainingConfig, loss_of_preset
-from viflow_anomaly.errors import CheckpointError, ConfigError
+from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.evaluation.endpoint_error import EndpointErrors, measure_endpoint_errors, require_ground_truth
 from viflow_anomaly.losses import LossResult, photometric_loss, squared_error_loss
 from viflow_anomaly.model.builder import build_model
@@ -32,6 +30,7 @@ from viflow_anomaly.runtime.torch_runtime import TorchRuntime
 from viflow_anomaly.training_data import TrainingData, load_training_data
 from viflow_anomaly.training_init import read_initial_weights
 from viflow_anomaly.training_progress import TrainingProgress
+from viflow_anomaly.training_state import reached_step, require_same_run, restore_state, state_tensors
 
 
 class TrainingRun:
@@ -119,9 +118,7 @@ class TrainingRun:
 
     def save(self, folder: Path, fingerprint: Mapping[str, Any]) -> None:
         """Write the whole state atomically."""
-        tensors = {f"model.{key}": value for key, value in self.network.state_dict().items()}
-        for index, state in self.optimizer.state_dict()["state"].items():
-            tensors |= {f"optimizer.{index}.{key}": torch.as_tensor(value) for key, value in state.items()}
+        tensors = state_tensors(self.network, self.optimizer)
         fitted = {"motor": self.model_config.motor.model_dump(mode="json")}
         save_training_state(folder, tensors, {"step": self.step, **fitted, **fingerprint})
 
@@ -136,54 +133,10 @@ class TrainingRun:
         if loaded is None:
             return False
         tensors, record = loaded
-        _require_same_run(folder, record, fingerprint)
-        try:
-            self.network.load_state_dict(_below(tensors, "model."))
-            self._restore_optimizer(_below(tensors, "optimizer."))
-            self.step = int(record["step"])
-        except (RuntimeError, ValueError, LookupError) as err:
-            raise CheckpointError(
-                f"{folder}: expected the whole state of this training, found: {' '.join(str(err).split())[:300]}",
-                code="checkpoint_corrupt",
-                field="out",
-            ) from err
+        require_same_run(folder, record, fingerprint)
+        restore_state(self.network, self.optimizer, tensors, folder)
+        self.step = reached_step(record, folder)
         return True
-
-    def _restore_optimizer(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        parameters = list(self.network.parameters())
-        states: dict[int, dict[str, torch.Tensor]] = {}
-        for key, value in tensors.items():
-            index, name = key.split(".", 1)
-            # A moment of another memory layout than its parameter's would take another arithmetic path.
-            like = parameters[int(index)]
-            same_layout = torch.empty_like(like).copy_(value) if value.shape == like.shape else value
-            states.setdefault(int(index), {})[name] = same_layout
-        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": states})
-
-
-def _require_same_run(folder: Path, record: Mapping[str, Any], fingerprint: Mapping[str, Any]) -> None:
-    for key, value in fingerprint.items():
-        before, now = record.get(key), json.loads(json.dumps(value))
-        if before != now:
-            raise ConfigError(
-                f"{folder}: --resume expects the {key} that the run was started with, {_difference(before, now)}",
-                code="resume_config_differs",
-                field=key,
-            )
-
-
-def _below(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
-    return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
-
-
-def _difference(before: object, now: object) -> str:
-    """What the error shows: both values; of lists of names, which may be hundreds long, only what one of them lacks."""
-    if not isinstance(now, list):
-        return f"{before}, found {now}"
-    if not isinstance(before, list):
-        return f"which its state does not name, found {len(now)}"
-    lost, added = ((Counter(one) - Counter(other)).elements() for one, other in ((before, now), (now, before)))
-    return f"{len(before)}, found {len(now)}: without {sorted(lost)[:5]}, with {sorted(added)[:5]}"
 
 
 def learning_rate(config: TrainingConfig, step: int) -> float:
@@ -295,7 +248,7 @@ def _going_on(
             field="out",
         )
     record = loaded[1]
-    _require_same_run(out_dir, record, fingerprint)
+    require_same_run(out_dir, record, fingerprint)
     step = record.get("step")
     if "motor" in record:
         motor = MotorConfig.from_mapping(record["motor"], where=str(out_dir / "state.safetensors"))

@@ -41,6 +41,20 @@ def restore_state(
         ) from err
 
 
+def reached_step(record: Mapping[str, Any], folder: Path) -> int:
+    """The step that a saved training had reached.
+
+    Raises:
+        CheckpointError: ``checkpoint_corrupt``.
+    """
+    step = record.get("step")
+    if not isinstance(step, int):
+        raise CheckpointError(
+            f"{folder}: expected the step that was reached, found {step!r}", code="checkpoint_corrupt", field="out"
+        )
+    return step
+
+
 def _restore_optimizer(
     network: nn.Module, optimizer: torch.optim.Optimizer, tensors: Mapping[str, torch.Tensor]
 ) -> None:
