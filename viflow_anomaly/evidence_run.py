@@ -16,6 +16,7 @@ from viflow_anomaly.checkpoint_record import BUNDLED_EVIDENCE_NAME, EvidenceReco
 from viflow_anomaly.config import EvidenceTrainingConfig
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import ConfigError
+from viflow_anomaly.evaluation.labelled_pairs import SimulatedPairs
 from viflow_anomaly.evidence_cues import GEOMETRIC_CUES, PHOTOMETRIC_CUES
 from viflow_anomaly.evidence_data import EvidenceData, load_examples
 from viflow_anomaly.evidence_training import EvidenceTraining
@@ -62,6 +63,8 @@ def train_evidence(
     require_device(device)
     data, calibration = (sorted(some, key=lambda path: (path.name, path)) for some in (data, calibration))
     _require_apart(data, calibration)
+    for path in calibration:
+        SimulatedPairs(path)  # what is wrong with one should be told before the training, not after it
     if (out_dir / "state.safetensors").exists() and not resume:
         raise ConfigError(
             f"{out_dir}: expected a directory without a training run, found one; --resume goes on with it",

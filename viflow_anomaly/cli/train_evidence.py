@@ -54,7 +54,7 @@ def train_evidence(
     settings = settings_from(config, assignments, options)
     from viflow_anomaly.evidence_run import train_evidence as train_head
 
-    folders = [path for folder in calibration for path in sorted(folder.iterdir()) if path.is_dir()]
+    folders = [path for folder in calibration for path in recordings_in(folder)]
     with stderr_progress() as progress:
         task = progress.add_task("reading", total=None)
         head = train_head(
@@ -68,6 +68,11 @@ def train_evidence(
             report=lambda what, done, total: progress.update(task, description=what, completed=done, total=total),
         )
     print(head)
+
+
+def recordings_in(folder: Path) -> list[Path]:
+    """Its sub-folders by name; hidden ones, such as a simulation that is still being written, are none."""
+    return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
 
 
 def register(app: typer.Typer) -> None:
