@@ -29,6 +29,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import cv2
 import numpy as np
 
+from viflow_anomaly.allocator import keep_freed_memory
 from viflow_anomaly.checkpoint_record import source_commit, write_atomically
 from viflow_anomaly.cli.pair_files import PairFiles, load_pair
 from viflow_anomaly.config import ImageLimits, RuntimeName
@@ -251,6 +252,7 @@ def parse_arguments() -> argparse.Namespace:
 def main() -> None:
     arguments = parse_arguments()
     cv2.setNumThreads(1)
+    keep_freed_memory()  # as the command line and the service do
     load_before = os.getloadavg()[0]
     folder = arguments.sample
     files = PairFiles(folder / "source.png", folder / "target.png", folder / "imu.json", folder / "camera.json")

@@ -166,13 +166,21 @@ def correct_motion(
     )
 
 
-def parallax_slope(rays: Float32Array, inverse_depth: Float32Array, motion: RigidMotion) -> Float32Array:
-    """[h, w, 2] derivative of the static flow by the logarithm of the inverse depth, in focal lengths.
+class MovedCells(NamedTuple):
+    """Every cell after the motion: x and y [h, w] in focal lengths, its inverse depth there, and ``slope`` [h, w, 2],
+    the derivative of (x, y) by the logarithm of the inverse depth. The slope's direction is that of the epipolar line,
+    its length the parallax that a point at this depth shows."""
 
-    Its direction is that of the epipolar line; its length is the parallax that a point at this depth shows.
-    """
-    x, y = rays[..., 0], rays[..., 1]
-    return _slope(_moved(x, y, inverse_depth, motion), motion)
+    x: Float32Array
+    y: Float32Array
+    nearness: Float32Array
+    slope: Float32Array
+
+
+def moved_cells(rays: Float32Array, inverse_depth: Float32Array, motion: RigidMotion) -> MovedCells:
+    """Where the cells of rays [h, w, 2] go."""
+    moved = _moved(rays[..., 0], rays[..., 1], inverse_depth, motion)
+    return MovedCells(*moved, _slope(moved, motion))
 
 
 def _slope(moved: tuple[Float32Array, Float32Array, Float32Array], motion: RigidMotion) -> Float32Array:

@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viflow_anomaly.config import EVIDENCE_BLOCK_PX
-from viflow_anomaly.correction import parallax_slope
+from viflow_anomaly.correction import moved_cells
 from viflow_anomaly.explanation import Explanation
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.measured_flow import measure_remaining_flow
+from viflow_anomaly.motion_refinement import Line, MovedPoints, common_motion_px
 from viflow_anomaly.prediction import PredictedFlow, view_rays
 from viflow_anomaly.view import InternalView
 
@@ -84,18 +85,26 @@ def evidence_cues(explained: Explanation, *, focal_px: float) -> EvidenceCues:
 
     blocks = (width // EVIDENCE_BLOCK_PX, height // EVIDENCE_BLOCK_PX)
     geometric = np.empty((len(GEOMETRIC_CUES), *blocks[::-1]), dtype=np.float32)
+    inside_share = np.asarray(cv2.resize(inside * np.float32(1), blocks, interpolation=cv2.INTER_AREA), np.float32)
     remaining = measure_remaining_flow(source, rebuilt, block_px=EVIDENCE_BLOCK_PX)
-    slope, log_ratio, log_depth = _parallax(predicted, view, blocks, focal_px)
-    line = _epipolar_lines(slope)
-    _split_along(remaining.flow_px, line, geometric[0:2])
-    _split_along(remaining.local_flow_px, line, geometric[10:12])
-    _bound(np.linalg.norm(remaining.flow_px, axis=-1), HALF_REMAINING_PX, geometric[2])
+    depth = _depth_on_blocks(predicted, view, blocks, focal_px)
+    line = _epipolar_lines(depth.slope_px)
+    remaining_px, local_px = remaining.flow_px, remaining.local_flow_px
+    if depth.points is not None:
+        texture = np.maximum(remaining.texture_gray2, 0)
+        trust = texture / (texture + np.float32(HALF_TEXTURE_GRAY2)) * inside_share
+        focal = (view.step_px[0] * focal_px, view.step_px[1] * focal_px)
+        common = common_motion_px(remaining_px, trust, depth.points, line, focal)
+        remaining_px, local_px = remaining_px - common, local_px - common
+    _split_along(remaining_px, line, geometric[0:2])
+    _split_along(local_px, line, geometric[10:12])
+    _bound(np.linalg.norm(remaining_px, axis=-1), HALF_REMAINING_PX, geometric[2])
     _bound(line.parallax_px, HALF_PARALLAX_PX, geometric[5])
     _bound(remaining.mismatch_gray, HALF_MISMATCH_GRAY, geometric[3])
     _bound(remaining.texture_gray2, HALF_TEXTURE_GRAY2, geometric[4])
-    np.clip(log_ratio, -1, 1, out=geometric[6])
-    np.clip(log_depth * np.float32(0.5), -1, 1, out=geometric[7])
-    geometric[8] = cv2.resize(inside * np.float32(1), blocks, interpolation=cv2.INTER_AREA)
+    np.clip(depth.log_ratio, -1, 1, out=geometric[6])
+    np.clip(depth.log_inverse_depth * np.float32(0.5), -1, 1, out=geometric[7])
+    geometric[8] = inside_share
     flow_px = _on_blocks(predicted.flow_px, predicted, view, blocks) * np.array(view.step_px, dtype=np.float32)
     _bound(np.linalg.norm(flow_px, axis=-1), HALF_FLOW_PX, geometric[9])
     return EvidenceCues(photometric, geometric)
@@ -117,40 +126,48 @@ def _bound(values: Float32Array, half: float, out: Float32Array) -> None:
     np.divide(values, out, out=out)
 
 
-def _parallax(
+class _DepthOnBlocks(NamedTuple):
+    """What the corrected depth and motion say of each block [h, w]; zeros where the network gives flow only.
+
+    Attributes:
+        slope_px: [h, w, 2] source pixels for a change of the inverse depth's logarithm by one.
+        log_ratio: that change as the correction made it.
+        log_inverse_depth: the logarithm itself.
+        points: after the motion; None where the network gives flow only.
+    """
+
+    slope_px: Float32Array
+    log_ratio: Float32Array
+    log_inverse_depth: Float32Array
+    points: MovedPoints | None
+
+
+def _depth_on_blocks(
     predicted: PredictedFlow, view: InternalView, blocks: tuple[int, int], focal_px: float
-) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """On blocks: slope [h, w, 2] in source pixels for a change of the inverse depth's logarithm by one, that change
-    [h, w] as the correction made it, and the logarithm itself; zeros where the network gives flow only."""
+) -> _DepthOnBlocks:
     correction, shape = predicted.correction, predicted.flow_px.shape[:2]
-    cells = np.zeros((*shape, 4), dtype=np.float32)
-    if correction is not None and correction.motion is not None and correction.inverse_depth is not None:
-        rays = view_rays(*shape, predicted.stride, view.height, view.width, focal_px)
-        slope = parallax_slope(rays, correction.inverse_depth, correction.motion)
-        np.multiply(slope, np.array(view.step_px, dtype=np.float32) * np.float32(focal_px), out=cells[..., :2])
-        np.log(np.maximum(correction.inverse_depth, MIN_INVERSE_DEPTH), out=cells[..., 3])
-        if correction.log_depth_ratio is not None:
-            cells[..., 2] = correction.log_depth_ratio
-    sampled = _on_blocks(cells, predicted, view, blocks)
-    return sampled[..., :2], sampled[..., 2], sampled[..., 3]
+    if correction is None or correction.motion is None or correction.inverse_depth is None:
+        none = np.zeros(blocks[::-1], dtype=np.float32)
+        return _DepthOnBlocks(np.zeros((*none.shape, 2), np.float32), none, none, None)
+    rays = view_rays(*shape, predicted.stride, view.height, view.width, focal_px)
+    moved = moved_cells(rays, correction.inverse_depth, correction.motion)
+    log_depth = np.log(np.maximum(correction.inverse_depth, MIN_INVERSE_DEPTH))
+    log_ratio = np.zeros_like(log_depth) if correction.log_depth_ratio is None else correction.log_depth_ratio
+    slope = moved.slope * (np.array(view.step_px, dtype=np.float32) * np.float32(focal_px))
+    first = _on_blocks(np.dstack([slope, log_ratio, log_depth]), predicted, view, blocks)
+    second = _on_blocks(np.dstack([moved.x, moved.y, moved.nearness]), predicted, view, blocks)
+    points = MovedPoints(*(np.ascontiguousarray(second[..., axis]) for axis in range(3)))
+    return _DepthOnBlocks(first[..., :2], first[..., 2], first[..., 3], points)
 
 
-class _EpipolarLines(NamedTuple):
-    """Unit vectors [h, w] of x and y along which a static point may move, and by how much it does as its depth says."""
-
-    x: Float32Array
-    y: Float32Array
-    parallax_px: Float32Array
-
-
-def _epipolar_lines(slope_px: Float32Array) -> _EpipolarLines:
+def _epipolar_lines(slope_px: Float32Array) -> Line:
     x, y = slope_px[..., 0] + np.float32(MIN_PARALLAX_PX), slope_px[..., 1]
     length = np.sqrt(x * x + y * y)
     inverse = 1 / np.maximum(length, np.float32(1e-6))
-    return _EpipolarLines(x * inverse, y * inverse, length)
+    return Line(x * inverse, y * inverse, length)
 
 
-def _split_along(flow_px: Float32Array, line: _EpipolarLines, out: Float32Array) -> None:
+def _split_along(flow_px: Float32Array, line: Line, out: Float32Array) -> None:
     """[2, h, w]: how far a flow goes across and along the line, bounded."""
     u, v = flow_px[..., 0], flow_px[..., 1]
     _bound(v * line.x - u * line.y, HALF_REMAINING_PX, out[0])

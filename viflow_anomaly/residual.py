@@ -20,9 +20,9 @@ BOUNDARY_TOLERANCE_PX = 1e-3
 """float32 coordinates a thousand pixels from the origin carry errors of 1e-4; such a coordinate is still inside."""
 
 
-EXPOSURE_SAMPLES = 2_000
+EXPOSURE_SAMPLES = 1_000
 MIN_EXPOSURE_SAMPLES = 100
-EXPOSURE_ROUNDS = 6
+EXPOSURE_ROUNDS = 4
 EXPOSURE_TOLERANCE_GRAY = 6.0
 EXPOSURE_PRIOR_GRAY = 2.0
 """Deviation of the gray levels below which a gain cannot be told from a bias."""
@@ -86,14 +86,16 @@ def compensate_exposure(reconstruction: Float32Array, source: Uint8Array, inside
         return reconstruction
     gain, bias = 1.0, float(np.median(y - x))
     for _ in range(EXPOSURE_ROUNDS):
-        error = (gain * x + bias - y) / EXPOSURE_TOLERANCE_GRAY
+        error = (gain * x + bias - y) * (1 / EXPOSURE_TOLERANCE_GRAY)
         weights = 1 / (1 + error * error)
-        middle_x, middle_y = np.average(x, weights=weights), np.average(y, weights=weights)
-        spread = (weights * (x - middle_x) ** 2).sum()
+        total = float(weights.sum())
+        middle_x, middle_y = float(weights @ x) / total, float(weights @ y) / total
+        from_middle = x - middle_x
+        weights *= from_middle
         # A uniform picture says nothing of the gain: the prior keeps it at 1.
-        prior = EXPOSURE_PRIOR_GRAY**2 * weights.sum()
-        gain = float(((weights * (x - middle_x) * (y - middle_y)).sum() + prior) / (spread + prior))
-        bias = float(middle_y - gain * middle_x)
+        prior = EXPOSURE_PRIOR_GRAY**2 * total
+        gain = (float(weights @ (y - middle_y)) + prior) / (float(weights @ from_middle) + prior)
+        bias = middle_y - gain * middle_x
     if not 1 / MAX_GAIN <= gain <= MAX_GAIN:
         return reconstruction
     compensated = reconstruction * np.float32(gain) + np.float32(bias)

@@ -14,6 +14,7 @@ from typing import Annotated
 import typer
 from typer.exceptions import TyperException
 
+from viflow_anomaly.allocator import keep_freed_memory
 from viflow_anomaly.cli import (
     batch,
     calibrate,
@@ -111,4 +112,5 @@ def main() -> None:
     """The console script."""
     # Idle OpenMP threads that spin slow every other process down; torch reads this once, when it loads.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    keep_freed_memory()
     sys.exit(run(sys.argv[1:]))
