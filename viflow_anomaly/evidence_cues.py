@@ -92,7 +92,7 @@ def evidence_cues(explained: Explanation, *, focal_px: float) -> EvidenceCues:
     remaining_px, local_px = remaining.flow_px, remaining.local_flow_px
     if depth.points is not None:
         texture = np.maximum(remaining.texture_gray2, 0)
-        trust = texture / (texture + np.float32(HALF_TEXTURE_GRAY2)) * inside_share
+        trust = np.asarray(texture / (texture + HALF_TEXTURE_GRAY2) * inside_share, dtype=np.float32)
         focal = (view.step_px[0] * focal_px, view.step_px[1] * focal_px)
         common = common_motion_px(remaining_px, trust, depth.points, line, focal)
         remaining_px, local_px = remaining_px - common, local_px - common
