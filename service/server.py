@@ -9,6 +9,7 @@ import socket
 
 import uvicorn
 
+from viflow_anomaly.allocator import keep_freed_memory
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly_service.app import DetectorLoader, create_app, load_bundled_or_configured
 from viflow_anomaly_service.request_log import configure_logging
@@ -29,6 +30,7 @@ def run(settings: ServiceSettings, *, load_detector: DetectorLoader = load_bundl
             server has ended by then.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    keep_freed_memory()
     configure_logging(settings.log_level)
     listener = bind(settings.host, settings.port)
     failures: list[Exception] = []

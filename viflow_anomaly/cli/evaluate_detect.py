@@ -20,7 +20,7 @@ from viflow_anomaly.cli.options import (
     settings_from,
 )
 from viflow_anomaly.cli.progress import stderr_progress
-from viflow_anomaly.cli.tables import rich_table
+from viflow_anomaly.cli.tables import report_console, rich_table
 
 if TYPE_CHECKING:
     from viflow_anomaly.evaluation.detection_methods import DetectionMethod
@@ -109,11 +109,9 @@ def _json(report: dict[str, Any]) -> str:
 
 
 def _print(report: dict[str, Any]) -> None:
-    from rich.console import Console
-
     from viflow_anomaly.evaluation.detection_tables import class_tables, notes, report_tables
 
-    console = Console()
+    console = report_console()
     for table in (*report_tables(report), *class_tables(report)):
         console.print(rich_table(table))
     for line in notes(report):

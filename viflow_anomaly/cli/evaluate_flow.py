@@ -23,7 +23,7 @@ from viflow_anomaly.cli.flow_inputs import (
 )
 from viflow_anomaly.cli.options import AsJson, Assignments, ConfigFile, Device, Threads, settings_from
 from viflow_anomaly.cli.progress import stderr_progress
-from viflow_anomaly.cli.tables import rich_table
+from viflow_anomaly.cli.tables import report_console, rich_table
 
 if TYPE_CHECKING:
     from viflow_anomaly.evaluation.flow_methods import FlowMethod
@@ -168,11 +168,9 @@ def _json(report: dict[str, Any]) -> str:
 
 
 def _print(report: dict[str, Any]) -> None:
-    from rich.console import Console
-
     from viflow_anomaly.evaluation.flow_tables import notes, paper_table, report_tables
 
-    console = Console()
+    console = report_console()
     for table in report_tables(report):
         console.print(rich_table(table))
     for line in notes(report):

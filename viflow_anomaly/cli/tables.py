@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table as RichTable
 
     from viflow_anomaly.evaluation.flow_tables import Table
+
+
+WIDTH_WITHOUT_TERMINAL = 200
+"""Characters a line; rich's own default of 80 would cut most of the figures off."""
 
 
 def rich_table(table: Table) -> RichTable:
@@ -25,3 +31,10 @@ def rich_table(table: Table) -> RichTable:
     for row in table.rows:
         shown.add_row(*map(escape, row))
     return shown
+
+
+def report_console() -> Console:
+    """For tables of many columns: as wide as the terminal, and wide enough for all of them into a file or a pipe."""
+    from rich.console import Console
+
+    return Console() if sys.stdout.isatty() else Console(width=WIDTH_WITHOUT_TERMINAL)
