@@ -9,6 +9,7 @@ import typer
 
 from viflow_anomaly.cli.options import Assignments, Checkpoint, ConfigFile, Device, load_detector, settings_from
 from viflow_anomaly.cli.progress import stderr_progress
+from viflow_anomaly.errors import DatasetError
 
 
 def train_evidence(
@@ -71,7 +72,18 @@ def train_evidence(
 
 
 def recordings_in(folder: Path) -> list[Path]:
-    """Its sub-folders by name; hidden ones, such as a simulation that is still being written, are none."""
+    """Its sub-folders by name; hidden ones, such as a simulation that is still being written, are none.
+
+    Raises:
+        DatasetError: ``directory_missing``.
+    """
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "nothing there"
+        raise DatasetError(
+            f"{folder}: expected a folder of recordings for --calibration, found {found}",
+            code="directory_missing",
+            field="calibration",
+        )
     return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
 
 
