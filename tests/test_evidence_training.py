@@ -147,6 +147,14 @@ def test_lists_must_not_overlap_or_be_empty(tmp_path: Path, detector: AnomalyDet
     assert not (tmp_path / "out").exists()
 
 
+def test_a_head_is_fitted_where_regions_would_come_from_the_residual(tmp_path: Path, detector: AnomalyDetector) -> None:
+    moved = easily_moved(detector)
+    residual = moved.with_config(moved.config.model_copy(update={"evidence": "residual"}))
+    data, calibration = [recording(tmp_path / "drone_1")], [recording(tmp_path / "drone_2")]
+    path = train_evidence(data, tmp_path / "out", calibration=calibration, detector=residual, training=SMALL)
+    assert load_evidence_head(path).record.region_score.weights
+
+
 def test_a_file_is_no_place_for_a_training(tmp_path: Path, detector: AnomalyDetector) -> None:
     data, calibration = [recording(tmp_path / "drone_1")], [recording(tmp_path / "drone_2")]
     (tmp_path / "out").write_text("mine")

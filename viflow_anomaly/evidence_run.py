@@ -152,8 +152,9 @@ def _with_scores(
 ) -> Path:
     """Write the checkpoint with what its regions score, fitted on recordings that it has not seen."""
     runtime = TorchEvidence(run.network.eval(), device=run.device)
+    judging = detector.with_evidence(LoadedEvidence(runtime, record))
     regions = labelled_regions(
-        detector.with_evidence(LoadedEvidence(runtime, record)),
+        judging.with_config(detector.config.model_copy(update={"evidence": "learned"})),
         calibration,
         on_progress=lambda done, total: report("calibrating", done, total),
     )

@@ -53,6 +53,8 @@ def train_evidence(
         "device": device,
     }
     settings = settings_from(config, assignments, options)
+    # There is no head yet, and the one that comes judges every pair.
+    settings = settings.model_copy(update={"detector": settings.detector.model_copy(update={"evidence": "auto"})})
     from viflow_anomaly.evidence_run import train_evidence as train_head
 
     folders = [path for folder in calibration for path in recordings_in(folder)]
