@@ -18,6 +18,7 @@ from viflow_anomaly import batch_files, batch_record
 from viflow_anomaly.batch_files import Journal
 from viflow_anomaly.batch_job import BatchOptions, run_batch
 from viflow_anomaly.batch_pictures import spread_indices
+from viflow_anomaly.batch_record import check_same_run
 from viflow_anomaly.config import DetectorConfig, RegionConfig, RigEstimateConfig, TrackingConfig
 from viflow_anomaly.datasets.recording import FileRecording
 from viflow_anomaly.detection import ModelInfo, load_detection_schema
@@ -531,3 +532,11 @@ def test_journal_syncs_now_and_then(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     with Journal(tmp_path / "journal") as journal:
         journal.append((1, 2), "ok", "{}")
         assert len(synced) == 1
+
+
+def test_another_evidence_head_is_another_run(tmp_path: Path) -> None:
+    earlier = {"model": {"sha256": "a", "version": "1+head.b"}}
+    check_same_run(earlier, earlier, out_dir=tmp_path)
+    with pytest.raises(InvalidInputError, match=r"model\.version") as caught:
+        check_same_run(earlier, {"model": {"sha256": "a", "version": "1+head.c"}}, out_dir=tmp_path)
+    assert caught.value.code == "resume_config_differs"

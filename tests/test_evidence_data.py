@@ -92,6 +92,17 @@ def test_what_was_kept_is_read_as_long_as_it_would_be_the_same(tmp_path: Path, d
     assert [one.name for one in kept.iterdir()] == ["drone_1.npz"]
 
 
+def test_another_recording_of_the_same_name_is_read(tmp_path: Path, detector: AnomalyDetector) -> None:
+    one, two = recording(tmp_path / "a" / "drone_1"), recording(tmp_path / "b" / "drone_1", frames=4)
+    assert [len(kept_examples(detector, path, tmp_path / "cues")) for path in (one, two, one)] == [2, 3, 2]
+
+
+def test_what_is_no_recording_is_told_before_any_is_read(tmp_path: Path, detector: AnomalyDetector) -> None:
+    with pytest.raises(DatasetError, match="nothing there"):
+        load_examples(detector, [recording(tmp_path / "drone_1"), tmp_path / "drone_2"], tmp_path / "cues")
+    assert not (tmp_path / "cues").exists()
+
+
 def test_a_damaged_file_is_named(tmp_path: Path, detector: AnomalyDetector) -> None:
     path, kept = recording(tmp_path / "drone_1"), tmp_path / "cues"
     kept_examples(detector, path, kept)

@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 
 from viflow_anomaly.checkpoint import load_evidence_head
 from viflow_anomaly.checkpoint_record import EvidenceRecord, read_tensors
+from viflow_anomaly.cli.train_evidence import recordings_in
+from viflow_anomaly.config import EvidenceTrainingConfig
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import CheckpointError, ConfigError, DatasetError
 from viflow_anomaly.evidence_cues import GEOMETRIC_CUES
@@ -143,6 +145,45 @@ def test_lists_must_not_overlap_or_be_empty(tmp_path: Path, detector: AnomalyDet
             train_evidence(data, tmp_path / "out", calibration=calibration, detector=detector, training=SMALL)
         assert caught.value.code == code
     assert not (tmp_path / "out").exists()
+
+
+def test_a_head_is_fitted_where_regions_would_come_from_the_residual(tmp_path: Path, detector: AnomalyDetector) -> None:
+    moved = easily_moved(detector)
+    residual = moved.with_config(moved.config.model_copy(update={"evidence": "residual"}))
+    data, calibration = [recording(tmp_path / "drone_1")], [recording(tmp_path / "drone_2")]
+    path = train_evidence(data, tmp_path / "out", calibration=calibration, detector=residual, training=SMALL)
+    assert load_evidence_head(path).record.region_score.weights
+
+
+def test_a_file_is_no_place_for_a_training(tmp_path: Path, detector: AnomalyDetector) -> None:
+    data, calibration = [recording(tmp_path / "drone_1")], [recording(tmp_path / "drone_2")]
+    (tmp_path / "out").write_text("mine")
+    with pytest.raises(ConfigError, match="found a file") as caught:
+        train_evidence(data, tmp_path / "out", calibration=calibration, detector=detector, training=SMALL)
+    assert caught.value.code == "output_unusable"
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"head": {"widths": [10**6] * 4}},
+        {"batch_size": 10**8},
+        {"learning_rate": 1e300},
+        {"weight_decay": 1e300},
+        {"crop_width": 32 * 10**6},
+    ],
+)
+def test_absurd_numbers_are_refused(values: dict[str, object]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        EvidenceTrainingConfig.from_mapping(values, where="test")
+    assert caught.value.code == "config_invalid"
+
+
+def test_the_folder_of_calibration_must_be_one(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for name, found in (("missing", "nothing there"), ("file", "a file")):
+        with pytest.raises(DatasetError, match=f"expected a folder of recordings.*{found}"):
+            recordings_in(tmp_path / name)
 
 
 def test_scores_need_regions(tmp_path: Path, detector: AnomalyDetector) -> None:

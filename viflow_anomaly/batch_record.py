@@ -20,6 +20,7 @@ from viflow_anomaly.errors import InvalidInputError
 # What a resumed run must have in common with the run it goes on with.
 _DECISIVE = (
     "model.sha256",
+    "model.version",  # names the evidence head, too
     "configuration.detector",
     "options.look_ahead",
     "options.tracking",

@@ -326,10 +326,14 @@ EVIDENCE_BLOCK_PX = 4
 """Sides of the blocks of pixels that geometric cues are on, and at which the evidence head works."""
 
 
+Channels = Annotated[int, Field(ge=1, le=1024)]
+ScoreWeight = Annotated[float, Field(ge=-1e12, le=1e12)]
+
+
 class EvidenceHeadConfig(FrozenConfig):
     """What the builder needs to make an evidence head; saved in its checkpoint."""
 
-    widths: tuple[PositiveInt, PositiveInt, PositiveInt, PositiveInt] = Field(
+    widths: tuple[Channels, Channels, Channels, Channels] = Field(
         default=(32, 48, 64, 64), description="channels at strides 4, 8, 16 and 32"
     )
 
@@ -340,8 +344,8 @@ class RegionScore(FrozenConfig):
     ``weights`` go with ``moving_regions.REGION_FEATURES``; empty: the mean probability of its pixels stands.
     """
 
-    weights: tuple[float, ...] = ()
-    bias: float = 0.0
+    weights: tuple[ScoreWeight, ...] = ()
+    bias: ScoreWeight = 0.0
 
 
 class EvidenceTrainingConfig(FrozenConfig):
@@ -349,15 +353,15 @@ class EvidenceTrainingConfig(FrozenConfig):
 
     head: EvidenceHeadConfig = EvidenceHeadConfig()
     steps: PositiveInt = 12_000
-    batch_size: PositiveInt = 16
-    learning_rate: PositiveFloat = 2e-3
+    batch_size: int = Field(default=16, ge=1, le=4096)
+    learning_rate: float = Field(default=2e-3, gt=0, le=10)
     warmup_steps: int = Field(default=200, ge=0)
-    weight_decay: float = Field(default=1e-3, ge=0)
+    weight_decay: float = Field(default=1e-3, ge=0, le=10)
     gradient_clip: PositiveFloat = 1.0
-    motion_weight: PositiveFloat = Field(default=3.0, description="of a moving pixel beside a resting one")
-    seam_weight: float = Field(default=0.3, ge=0, description="of the loss of seams between two movers")
-    crop_width: int = Field(default=224, ge=32, multiple_of=32)
-    crop_height: int = Field(default=128, ge=32, multiple_of=32)
+    motion_weight: float = Field(default=3.0, gt=0, le=1e6, description="of a moving pixel beside a resting one")
+    seam_weight: float = Field(default=0.3, ge=0, le=1e6, description="of the loss of seams between two movers")
+    crop_width: int = Field(default=224, ge=32, le=8192, multiple_of=32)
+    crop_height: int = Field(default=128, ge=32, le=8192, multiple_of=32)
     every: PositiveInt = Field(default=1, description="take every n-th pair of a recording")
     checkpoint_every: PositiveInt = 500
     seed: int = Field(default=0, ge=0, le=2**63 - 1)
@@ -446,10 +450,10 @@ class TrainingConfig(FrozenConfig):
     """One training run; the seed fixes everything on a CPU."""
 
     steps: PositiveInt = 20_000
-    batch_size: PositiveInt = 16
-    learning_rate: PositiveFloat = 1e-3
+    batch_size: int = Field(default=16, ge=1, le=4096)
+    learning_rate: float = Field(default=1e-3, gt=0, le=10)
     warmup_steps: int = Field(default=500, ge=0)
-    weight_decay: float = Field(default=1e-4, ge=0)
+    weight_decay: float = Field(default=1e-4, ge=0, le=10)
     gradient_clip: PositiveFloat = 1.0
     loss: Literal["auto", "squared", "charbonnier", "corrected"] = "auto"
     relaxation: float = Field(default=0.05, ge=0, lt=1, description="weight of the mean over hypotheses")

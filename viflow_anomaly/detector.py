@@ -48,6 +48,12 @@ NOT_FINITE = Reason(
 )
 
 
+HEAD_NOT_FINITE = Reason(
+    code="prediction_not_finite",
+    message="expected finite numbers from the evidence head, found others: its weights are damaged",
+)
+
+
 class Analysis(NamedTuple):
     """A detection with the maps it was made from, for pictures and further processing.
 
@@ -198,6 +204,8 @@ class AnomalyDetector:
         if summary is None:
             finite = bool(np.isfinite(predicted.flow_px).all())
             findings = (*findings, Finding(NOTHING_IN_COMMON if finite else NOT_FINITE, abstain=True))
+        elif judged is not None and not judged.maps.finite:
+            findings = (*findings, Finding(HEAD_NOT_FINITE, abstain=True))
         elif not any(finding.abstain for finding in findings):
             findings = (*findings, *_doubts(predicted, model_input.window, self.config))
         abstained = any(finding.abstain for finding in findings)

@@ -7,6 +7,7 @@ folder holds ``photometric``, ``geometric`` (-1..1 as 0..255) and ``truth`` of e
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import zipfile
@@ -112,7 +113,7 @@ def kept_examples(detector: AnomalyDetector, path: Path, folder: Path, *, every:
     Raises:
         DatasetError: as ``extract_examples``; ``evidence_data_malformed`` for a file there that is none of these.
     """
-    kept, about = folder / f"{path.name}.npz", _made_with(detector, every)
+    kept, about = folder / f"{path.name}.npz", _made_with(detector, path, every)
     if kept.exists():
         examples = _read_kept(kept, about)
         if examples is not None:
@@ -130,8 +131,9 @@ def kept_examples(detector: AnomalyDetector, path: Path, folder: Path, *, every:
     return examples
 
 
-def _made_with(detector: AnomalyDetector, every: int) -> str:
-    """All that the cues of a recording depend on besides itself."""
+def _made_with(detector: AnomalyDetector, path: Path, every: int) -> str:
+    """All that the cues of a recording depend on; of the recording itself the names and sizes of its files."""
+    files = sorted((str(one.relative_to(path)), one.stat().st_size) for one in path.rglob("*") if one.is_file())
     config = detector.config
     about = {
         "model": detector.model_info.sha256,
@@ -140,6 +142,7 @@ def _made_with(detector: AnomalyDetector, every: int) -> str:
         "softening": config.regions.texture_softening_gray,
         "residual": (config.residual, config.photometric_compensation),
         "every": every,
+        "files": hashlib.sha256(json.dumps(files).encode()).hexdigest(),
     }
     return json.dumps(about, sort_keys=True)
 
@@ -268,6 +271,9 @@ def load_examples(
             code="recordings_share_a_name",
             field="data",
         )
+    for path in recordings:
+        if not (folder / f"{path.name}.npz").exists():
+            RecordingTruth(path)  # what is wrong with the last one should be told before the first takes its time
     examples = []
     for done, path in enumerate(recordings, start=1):
         examples.append(kept_examples(detector, path, folder, every=every))

@@ -55,8 +55,8 @@ def train_evidence(
         The checkpoint's path.
 
     Raises:
-        ConfigError: ``training_exists``, ``resume_config_differs``, ``device_unavailable``, ``training_diverged``;
-            ``calibration_trained_on`` where a recording is in both lists.
+        ConfigError: ``training_exists``, ``output_unusable``, ``resume_config_differs``, ``device_unavailable``,
+            ``training_diverged``; ``calibration_trained_on`` where a recording is in both lists.
         DatasetError: as ``load_examples`` and ``labelled_regions``.
         CheckpointError: ``checkpoint_corrupt`` for the state to go on from.
     """
@@ -65,6 +65,10 @@ def train_evidence(
     _require_apart(data, calibration)
     for path in calibration:
         SimulatedPairs(path)  # what is wrong with one should be told before the training, not after it
+    if out_dir.exists() and not out_dir.is_dir():
+        raise ConfigError(
+            f"{out_dir}: expected a directory or nothing, found a file", code="output_unusable", field="out"
+        )
     if (out_dir / "state.safetensors").exists() and not resume:
         raise ConfigError(
             f"{out_dir}: expected a directory without a training run, found one; --resume goes on with it",
@@ -148,8 +152,9 @@ def _with_scores(
 ) -> Path:
     """Write the checkpoint with what its regions score, fitted on recordings that it has not seen."""
     runtime = TorchEvidence(run.network.eval(), device=run.device)
+    judging = detector.with_evidence(LoadedEvidence(runtime, record))
     regions = labelled_regions(
-        detector.with_evidence(LoadedEvidence(runtime, record)),
+        judging.with_config(detector.config.model_copy(update={"evidence": "learned"})),
         calibration,
         on_progress=lambda done, total: report("calibrating", done, total),
     )

@@ -12,7 +12,7 @@ from viflow_anomaly.config import DetectorConfig
 from viflow_anomaly.errors import CheckpointError
 from viflow_anomaly.evidence_cues import GEOMETRIC_CUES, PHOTOMETRIC_CUES, EvidenceCues
 from viflow_anomaly.explanation import Explanation
-from viflow_anomaly.moving_regions import MotionMaps, find_moving_regions, sigmoid
+from viflow_anomaly.moving_regions import REGION_FEATURES, MotionMaps, find_moving_regions, sigmoid
 from viflow_anomaly.regions import Region, find_regions
 from viflow_anomaly.runtime.loading import LoadedEvidence
 
@@ -25,10 +25,10 @@ class JudgedCues(NamedTuple):
 
 
 def require_our_cues(record: EvidenceRecord) -> None:
-    """A head must have learned from the cues of this version.
+    """A head must have learned from the cues of this version, and score what this version measures of a region.
 
     Raises:
-        CheckpointError: ``evidence_cues_differ``.
+        CheckpointError: ``evidence_cues_differ``, ``checkpoint_record_invalid``.
     """
     expected, found = (PHOTOMETRIC_CUES, GEOMETRIC_CUES), (record.photometric_cues, record.geometric_cues)
     if expected != found:
@@ -36,6 +36,13 @@ def require_our_cues(record: EvidenceRecord) -> None:
             f"evidence head {record.name} {record.version}: expected one that was trained on the cues {expected}, "
             f"found {found}",
             code="evidence_cues_differ",
+            field="evidence_head",
+        )
+    if len(record.region_score.weights) not in (0, len(REGION_FEATURES)):
+        raise CheckpointError(
+            f"evidence head {record.name} {record.version}: expected {len(REGION_FEATURES)} weights in region_score "
+            f"(or none), found {len(record.region_score.weights)}",
+            code="checkpoint_record_invalid",
             field="evidence_head",
         )
 

@@ -64,6 +64,11 @@ class MotionMaps(NamedTuple):
     motion: Float32Array
     seam_logit: Float32Array
 
+    @property
+    def finite(self) -> bool:
+        """False where the head's weights are damaged."""
+        return bool(np.isfinite(self.motion).all() and np.isfinite(self.seam_logit).all())
+
 
 class MeasuredRegion(NamedTuple):
     """A component before it has a score: ``features`` [13] are ``REGION_FEATURES``, ``outline`` is its box's mask."""

@@ -184,6 +184,7 @@ def test_the_same_recording_twice_is_refused(ask: Ask, tmp_path: Path) -> None:
     ("option", "value"),
     [
         ("--false-alarms-per-hour", "0"),
+        ("--false-alarms-per-hour", "5e-324"),
         ("--false-alarms-per-hour", "nan"),
         ("--false-alarms-per-hour", "inf"),
         ("--confidence", "0"),

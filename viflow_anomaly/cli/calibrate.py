@@ -24,9 +24,13 @@ if TYPE_CHECKING:
     from viflow_anomaly.alarm_calibration import AlarmCalibration
 
 
+MIN_BUDGET_PER_HOUR = 1e-6
+"""One in a century."""
+
+
 def _budget(value: float) -> float:
-    if not 0 < value < math.inf:
-        raise typer.BadParameter(f"expected a number above 0, found {value:g}")
+    if not MIN_BUDGET_PER_HOUR <= value < math.inf:
+        raise typer.BadParameter(f"expected a number above 0, at least {MIN_BUDGET_PER_HOUR:g}, found {value:g}")
     return value
 
 

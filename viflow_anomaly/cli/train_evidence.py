@@ -9,6 +9,7 @@ import typer
 
 from viflow_anomaly.cli.options import Assignments, Checkpoint, ConfigFile, Device, load_detector, settings_from
 from viflow_anomaly.cli.progress import stderr_progress
+from viflow_anomaly.errors import DatasetError
 
 
 def train_evidence(
@@ -52,6 +53,8 @@ def train_evidence(
         "device": device,
     }
     settings = settings_from(config, assignments, options)
+    # There is no head yet, and the one that comes judges every pair.
+    settings = settings.model_copy(update={"detector": settings.detector.model_copy(update={"evidence": "auto"})})
     from viflow_anomaly.evidence_run import train_evidence as train_head
 
     folders = [path for folder in calibration for path in recordings_in(folder)]
@@ -71,7 +74,18 @@ def train_evidence(
 
 
 def recordings_in(folder: Path) -> list[Path]:
-    """Its sub-folders by name; hidden ones, such as a simulation that is still being written, are none."""
+    """Its sub-folders by name; hidden ones, such as a simulation that is still being written, are none.
+
+    Raises:
+        DatasetError: ``directory_missing``.
+    """
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "nothing there"
+        raise DatasetError(
+            f"{folder}: expected a folder of recordings for --calibration, found {found}",
+            code="directory_missing",
+            field="calibration",
+        )
     return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
 
 

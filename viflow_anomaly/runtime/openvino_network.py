@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Self
 
 import openvino
 
-from viflow_anomaly.checkpoint_record import TensorRecord, corrupt_checkpoint, read_checkpoint_file
+from viflow_anomaly.checkpoint_record import EvidenceRecord, TensorRecord, corrupt_checkpoint, read_checkpoint_file
 from viflow_anomaly.config import Precision
 from viflow_anomaly.errors import CheckpointError
 from viflow_anomaly.geometry import Float32Array
@@ -25,10 +25,11 @@ def _require_fresh(path: Path, data: bytes, record: TensorRecord) -> None:
     """An export must be the very file that was made from its checkpoint as it is now: the record names its checksum."""
     found = hashlib.sha256(data).hexdigest()
     if found != record.onnx_sha256:
+        option = "--evidence-head" if isinstance(record, EvidenceRecord) else "--checkpoint"
         raise CheckpointError(
             f"{path}: expected the export that {path.with_suffix('.json').name} names, sha256 {record.onnx_sha256}, "
             f"found {found}: altered, or older than the checkpoint; make it anew with "
-            f"viflow-anomaly export --checkpoint {path.with_suffix('.safetensors')}",
+            f"viflow-anomaly export {option} {path.with_suffix('.safetensors')}",
             code="export_stale",
             field="checkpoint",
         )
