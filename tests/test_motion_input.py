@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -338,3 +339,18 @@ def test_every_euroc_pair_fills_its_window(config: MotionWindowConfig, look_ahea
         assert window.faults == ()
         expected_rows = 10 + 10 * look_ahead if config is EUROC else config.rows
         assert np.count_nonzero(window.values.any(axis=1)) == expected_rows
+
+
+def test_a_gyro_alone_is_taken_where_it_may_be() -> None:
+    whole = make_pair(regular(200.0))
+    alone = replace(whole, imu=ImuSamples(whole.imu.timestamps_ns, whole.imu.gyro_rad_s))
+    config = MotionWindowConfig()
+    window, known = build_motion_window(alone, config, gyro_alone=True), build_motion_window(whole, config)
+    np.testing.assert_array_equal(window.values[:, :3], known.values[:, :3])
+    np.testing.assert_array_equal(window.values[:, 3:], np.tile(np.float32([0, -9.81, 0]), (config.rows, 1)))
+    assert [fault.code for fault in window.faults if fault not in known.faults] == ["no_accelerometer"]
+    np.testing.assert_array_equal(build_motion_window(whole, config, gyro_alone=True).values, known.values)
+    for refused in (config, config.model_copy(update={"axes": "sensor"})):
+        with pytest.raises(InvalidInputError) as caught:
+            build_motion_window(alone, refused, gyro_alone=refused.axes == "sensor")
+        assert caught.value.code == "imu_accel_missing"

@@ -40,7 +40,8 @@ def prepare(pair: FramePair, config: ModelConfig) -> ModelInput:
     """
     height, width = pair.source.image.shape
     view = make_view(config.view, width=width, height=height, camera=pair.camera)
-    window = build_motion_window(pair, config.motion_window)
+    # The calibrated preset takes its rotation from the gyro, and the correction finds the rest.
+    window = build_motion_window(pair, config.motion_window, gyro_alone=config.preset == "calibrated")
     motor = motor_input(pair, config)
     source, target = (view.render(frame.image) for frame in (pair.source, pair.target))
     return ModelInput(source, target, window, view, motor, rotation_known=config.uses_imu)

@@ -28,6 +28,14 @@ from viflow_anomaly.sensor_data import Float64Array, FramePair, ImuSamples, Pinh
 
 MAX_COVERAGE_TOLERANCE_S = 0.020
 """KITTI's frames and OXTS rows agree within 1 ms; 20 ms is the exposure and trigger delay of a slow camera."""
+UPRIGHT_AT_REST_M_S2 = (0.0, -9.81, 0.0)
+"""What an accelerometer in a level camera's axes (y down) reads at rest: against gravity."""
+GYRO_ALONE = ImuFault(
+    "no_accelerometer",
+    "There is no accelerometer: the camera is taken for upright and not accelerated, so the network's guesses of its "
+    "velocity are poorer; the correction on the target image makes up for most of that.",
+    "lowers_trust",
+)
 GAP_MIN_S = 0.015
 GAP_MEDIANS = 2.5
 GAP_INTERVALS = 2.0
@@ -79,10 +87,14 @@ class _Signal(NamedTuple):
     values: Float64Array
 
 
-def build_motion_window(pair: FramePair, config: MotionWindowConfig) -> MotionWindow:
+def build_motion_window(pair: FramePair, config: MotionWindowConfig, *, gyro_alone: bool = False) -> MotionWindow:
     """The window of ``pair`` in the layout of ``config``: [config.rows, 6] and its faults.
 
     The camera's ``time_offset_s`` moves the frame stamps to the IMU's clock first (t_imu = t_cam + offset).
+
+    Args:
+        gyro_alone: a sensor without accelerometer is taken, and the camera for upright and not accelerated (only with
+            ``config.axes`` "camera"); a fault says so.
 
     Raises:
         InvalidInputError: ``imu_accel_missing``, ``imu_not_covering``, ``imu_window_count``, ``imu_window_interval``
@@ -91,11 +103,12 @@ def build_motion_window(pair: FramePair, config: MotionWindowConfig) -> MotionWi
     interval_s = pair.interval_ns * 1e-9
     blocks = PAPER_LAYOUTS.get(config.layout)
     before_s, after_s = _reach(interval_s, config)
-    signal = _touched_samples(pair, -before_s, after_s)
+    gyro_alone = gyro_alone and config.axes == "camera" and pair.imu.accel_m_s2 is None
+    signal = _touched_samples(pair, -before_s, after_s, gyro_alone=gyro_alone)
     _require_coverage(signal.times_s, interval_s)
     faults = [
         *check_gyroscope(signal.values[:, :3]),
-        *check_accelerometer(signal.values[:, 3:]),
+        *([GYRO_ALONE] if gyro_alone else check_accelerometer(signal.values[:, 3:])),
         *check_spikes(signal.values[:, :3], signal.values[:, 3:]),
         *_check_interval(interval_s),
         *_check_rate(signal.times_s, interval_s),
@@ -108,6 +121,8 @@ def build_motion_window(pair: FramePair, config: MotionWindowConfig) -> MotionWi
         rows = _paper_rows(signal, interval_s, blocks)
     rows, mounting_faults = _in_requested_axes(rows, pair.camera, config)
     values = rows.astype(np.float32)
+    if gyro_alone:
+        values[:, 3:] = UPRIGHT_AT_REST_M_S2
     values.setflags(write=False)
     return MotionWindow(values, interval_s, (*faults, *mounting_faults), _turn_rate_rad_s(signal, interval_s))
 
@@ -123,10 +138,11 @@ def _reach(interval_s: float, config: MotionWindowConfig) -> tuple[float, float]
     return slowest * blocks.block_s, max(interval_s, after_s)
 
 
-def _touched_samples(pair: FramePair, start_s: float, end_s: float) -> _Signal:
+def _touched_samples(pair: FramePair, start_s: float, end_s: float, *, gyro_alone: bool) -> _Signal:
     """The samples from the last at or before ``start_s`` to the first at or after ``end_s``."""
     imu: ImuSamples = pair.imu
-    if imu.accel_m_s2 is None:
+    accel_m_s2 = np.zeros_like(imu.gyro_rad_s) if gyro_alone else imu.accel_m_s2
+    if accel_m_s2 is None:
         raise InvalidInputError(
             "accel_m_s2: expected one accelerometer reading per timestamp (the model needs it), found none",
             code="imu_accel_missing",
@@ -139,7 +155,7 @@ def _touched_samples(pair: FramePair, start_s: float, end_s: float) -> _Signal:
     first = max(int(np.searchsorted(times_s, start_s - STAMP_JITTER_S, side="right")) - 1, 0)
     last = int(np.searchsorted(times_s, end_s + STAMP_JITTER_S, side="left")) + 1
     kept = slice(first, last)
-    return _Signal(times_s[kept], np.concatenate([imu.gyro_rad_s[kept], imu.accel_m_s2[kept]], axis=1))
+    return _Signal(times_s[kept], np.concatenate([imu.gyro_rad_s[kept], accel_m_s2[kept]], axis=1))
 
 
 def _coverage_tolerance_s(times_s: Float64Array) -> float:

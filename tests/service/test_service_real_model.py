@@ -145,7 +145,6 @@ BAD_FOR_THE_MODEL = [
     pytest.param(
         {"imu": resting_imu(gyro_rad_s=[[0.0, 0.0, 90.0]] * 50)}, "imu_gyro_in_deg_s", "imu.gyro_rad_s", id="in deg/s"
     ),
-    pytest.param({"imu": resting_imu(accel_m_s2=None)}, "imu_accel_missing", "imu.accel_m_s2", id="gyro only"),
     pytest.param(
         {"camera": MOUNTED | {"distortion_model": "radtan", "distortion_coeffs": [-1, 0, 0, 0]}},
         "camera_invalid",
