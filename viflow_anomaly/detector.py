@@ -66,6 +66,7 @@ class Analysis(NamedTuple):
         reconstruction: [H, W] float32 source image rebuilt from the target.
         target_coordinates: [H, W, 2] float32 where each source pixel is predicted in the target image.
         predicted: the flow they come from, in the network's view, and its correction.
+        learned: the evidence head judged this pair, so that ``evidence`` are probabilities.
     """
 
     detection: Detection
@@ -75,6 +76,7 @@ class Analysis(NamedTuple):
     reconstruction: Float32Array
     target_coordinates: Float32Array
     predicted: PredictedFlow
+    learned: bool
 
     @property
     def flow_px(self) -> Float32Array:
@@ -238,7 +240,7 @@ class AnomalyDetector:
         )
         evidence = explained.normalised if judged is None else judged.maps.motion
         maps = (residual, evidence, inside, explained.reconstruction, explained.target_coordinates)
-        return Analysis(detection, *maps, predicted)
+        return Analysis(detection, *maps, predicted, learned=judged is not None)
 
     def judge_cues(self, pair: FramePair) -> tuple[JudgedCues, NDArray[np.bool_]] | None:
         """What the head says of a pair, and which pixels [H, W] are inside; None where regions come from the residual.

@@ -242,6 +242,13 @@ def test_serve_hands_the_runtime_over(ask: Ask, monkeypatch: pytest.MonkeyPatch)
     assert asked[0].runtime == "torch"
 
 
+def test_serve_hands_the_evidence_head_over(ask: Ask, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    stand_in(monkeypatch, "viflow_anomaly_service.server", run=asked.append)
+    assert ask(["serve", "--set", "evidence_head=head.safetensors", "--set", "precision=f32"]).code == 0
+    assert (asked[0].evidence_head, asked[0].precision) == (Path("head.safetensors"), "f32")
+
+
 def test_serve_hands_the_calibration_over(ask: Ask, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Any] = []
     stand_in(monkeypatch, "viflow_anomaly_service.server", run=asked.append)

@@ -117,6 +117,15 @@ def test_a_detector_is_measured_as_a_user_runs_it(detector: AnomalyDetector, two
     assert not method.rival
 
 
+def test_learned_evidence_is_cut_at_a_probability(two: FramePair) -> None:
+    regions = RegionConfig(min_motion_probability=0.3)
+    method = DetectorMethod(OURS, AnomalyDetector.from_checkpoint(config=DetectorConfig(regions=regions)))
+    judgement = method.judge(two)
+    (finding,) = judgement.findings
+    assert finding.thresholds == Thresholds(min_motion_probability=0.3)
+    assert 0 <= judgement.evidence.min() <= judgement.evidence.max() <= 1
+
+
 def test_a_rival_is_cut_at_every_threshold_with_the_papers_rule(two: FramePair) -> None:
     evidence = np.zeros(two.source.image.shape, np.float32)
     evidence[5:25, 5:25] = 30.0

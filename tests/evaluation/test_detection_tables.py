@@ -11,6 +11,7 @@ from drawn_methods import ELSEWHERE, HIGH, LOW, MOVER, DrawnMethod, DrawnPairs
 
 from viflow_anomaly.detection import ModelInfo
 from viflow_anomaly.errors import InvalidInputError
+from viflow_anomaly.evaluation.detection_methods import Thresholds
 from viflow_anomaly.evaluation.detection_plots import (
     draw_detection_figures,
     precision_by_class,
@@ -86,6 +87,13 @@ def test_thresholds_are_the_best_of_the_scope_else_of_everything(report: dict[st
     nothing = report_of(DrawnPairs("empty_1", "empty", 3, movers=()))
     assert nothing["all"]["rival|2"]["threshold_mads"] == LOW.threshold_mads
     assert nothing["all"]["rival|2"]["curve"] is None
+
+
+def test_the_thresholds_are_told_in_their_own_unit() -> None:
+    learned = DrawnMethod("learned", {Thresholds(min_motion_probability=0.4): [(MOVER, 0.9)]})
+    run = measure_detection([OURS, learned], [DrawnPairs("drone_1", "drone", 1)])
+    told = {row[0]: row[-1] for row in report_tables(detection_report(run, MODEL, {}))[0].rows}
+    assert told == {"ours": "3 MAD, 6", "learned": "p > 0.4"}
 
 
 def test_a_long_curve_is_thinned() -> None:

@@ -51,6 +51,8 @@ def serve(
             host=host,
             port=port,
             checkpoint=settings.checkpoint,
+            evidence_head=settings.evidence_head,
+            precision=settings.precision,
             calibration=settings.calibration,
             threads=settings.threads,
             device=settings.device,

@@ -25,17 +25,18 @@ PIXEL_SMOOTHING_PX = 1.2
 
 
 class Thresholds(NamedTuple):
-    """What regions of evidence are cut at (``RegionConfig``)."""
+    """What regions of evidence are cut at (``RegionConfig``): gray levels have the first two, probabilities the last."""
 
-    threshold_mads: float
-    min_residual_gray: float
+    threshold_mads: float | None = None
+    min_residual_gray: float | None = None
+    min_motion_probability: float | None = None
 
 
 RIVAL_THRESHOLDS = tuple(Thresholds(mads, gray) for mads in (3.0, 6.0, 12.0) for gray in (6.0, 12.0, 24.0, 48.0))
 
 
 class Finding(NamedTuple):
-    """Regions under one pair of thresholds.
+    """Regions under one choice of thresholds.
 
     Attributes:
         thresholds: which.
@@ -104,7 +105,10 @@ class DetectorMethod:
             boxes.append(ScoredBox(BoundingBox(box.x, box.y, box.width, box.height), roi.score, moves))
             if moves and roi.mask_rle is not None:
                 motion |= decode_mask_rle(roi.mask_rle)
-        thresholds = Thresholds(regions.threshold_mads, regions.min_residual_gray)
+        if analysis.learned:
+            thresholds = Thresholds(min_motion_probability=regions.min_motion_probability)
+        else:
+            thresholds = Thresholds(regions.threshold_mads, regions.min_residual_gray)
         finding = Finding(thresholds, tuple(boxes), motion)
         return Judgement(_smoothed(analysis.evidence), analysis.inside, (finding,))
 
@@ -133,7 +137,12 @@ class RivalMethod:
         self._evidence = evidence
         self._configs = {
             thresholds: config.model_copy(
-                update={**thresholds._asdict(), "shape_rule": "axis_aligned", "motion_score": 0.5}
+                update={
+                    "threshold_mads": thresholds.threshold_mads,
+                    "min_residual_gray": thresholds.min_residual_gray,
+                    "shape_rule": "axis_aligned",
+                    "motion_score": 0.5,
+                }
             )
             for thresholds in RIVAL_THRESHOLDS
         }

@@ -22,7 +22,7 @@ from viflow_anomaly.sensor_data import FramePair
 
 @dataclass
 class FindingScores:
-    """Under one pair of thresholds: boxes, and the pixels of what is labelled as motion."""
+    """Under one choice of thresholds: boxes, and the pixels of what is labelled as motion."""
 
     boxes: DetectionScores = field(default_factory=DetectionScores)
     masks: MaskScores = field(default_factory=MaskScores)

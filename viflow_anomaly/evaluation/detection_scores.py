@@ -135,7 +135,7 @@ class DetectionScores:
         return average_precision(curve.recall, curve.precision) if self.movers else None
 
     def alarms(self) -> int:
-        """False alarms as a user sees them: regions  labelled as motion."""
+        """False alarms as a user sees them: regions labelled as motion."""
         return sum(one.found is None and one.motion for one in self._judged)
 
     def summary(self) -> dict[str, Any]:

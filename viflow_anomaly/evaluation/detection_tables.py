@@ -86,6 +86,9 @@ def _name(scope: str) -> str:
 
 
 def _thresholds(figures: dict[str, Any]) -> str:
+    """MADs and gray levels of a residual, or the probability that a pixel needs."""
+    if figures["min_motion_probability"] is not None:
+        return f"p > {figures['min_motion_probability']:g}"
     return f"{figures['threshold_mads']:g} MAD, {figures['min_residual_gray']:g}"
 
 
