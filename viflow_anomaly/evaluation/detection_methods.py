@@ -25,7 +25,7 @@ PIXEL_SMOOTHING_PX = 1.2
 
 
 class Thresholds(NamedTuple):
-    """What regions of evidence are cut at (``RegionConfig``): gray levels have the first two, probabilities the last."""
+    """What evidence is cut at (``RegionConfig``): gray levels have the first two, probabilities the last."""
 
     threshold_mads: float | None = None
     min_residual_gray: float | None = None
