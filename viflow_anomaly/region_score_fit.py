@@ -72,7 +72,8 @@ def labelled_regions(
             on_progress(done, len(recordings))
     if not features:
         raise DatasetError(
-            f"expected regions that count in {len(recordings)} recordings, found none",
+            f"calibration: expected regions that count in {len(recordings)} recordings, found none: the head marks "
+            "nothing there yet (more steps?), or nothing moves",
             code="ground_truth_missing",
             field="calibration",
         )
