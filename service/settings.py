@@ -29,7 +29,7 @@ def _usable_cores() -> int:
 
 
 class ServiceSettings(BaseSettings):
-    """Settings of one service process; ``VIFLOW_PORT=9000`` or ``VIFLOW_DETECTOR__REGIONS__THRESHOLD_MADS=8``.
+    """Settings of one service process; ``VIFLOW_PORT=9000`` or ``VIFLOW_DETECTOR__REGIONS__MAX_REGIONS=8``.
 
     Build it with :func:`load_settings`, whose error names the variable at fault.
     """

@@ -27,7 +27,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 LOWEST_THRESHOLD = 0.5
-"""Every region that passes the shape rule scores at least this."""
+"""No region that scores less is ever labelled as motion (``RegionConfig.motion_score``)."""
 STEPS_PER_SCORE = 10_000
 """Thresholds have four decimals, as written scores have."""
 MIN_ALARM_BLOCKS = 30
@@ -37,11 +37,11 @@ as many then speaks, too."""
 
 @dataclass(frozen=True, eq=False)
 class ScoredFootage:
-    """Scores of the regions in footage without movers.
+    """Scores of the regions in footage without movers that some threshold would label as motion.
 
     Attributes:
         block_hours: [M] > 0, how long each block is.
-        scores: [K] of the regions that pass the shape rule.
+        scores: [K], of ``LOWEST_THRESHOLD`` and more.
         blocks: [K] in 0..M-1, which block each is in.
         hours_for_promise: shorter footage promises nothing, whatever its scores.
     """

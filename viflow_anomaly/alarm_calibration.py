@@ -75,7 +75,7 @@ class AlarmCalibration(FrozenConfig):
         bound_per_hour, expected_per_hour, lowest_bound_per_hour, hours_needed, alarms, alarm_blocks, clump: as
             ``ThresholdChoice``.
         hours, pairs: judged; ``abstained`` and ``failed`` pairs are in neither.
-        regions: that pass the shape rule, whatever their score.
+        regions: labelled as motion at the lowest threshold.
         detector: the configuration that the scores depend on; ``detector_sha256``: its digest.
         package_version: of viflow-anomaly.
         commit: of its source tree, where it ran from one.

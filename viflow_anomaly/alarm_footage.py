@@ -1,4 +1,6 @@
-"""Recordings -> the scores of all regions that pass the shape rule, in blocks of seconds; see ``alarm_budget``."""
+"""Recordings -> the scores of all regions that some threshold labels as motion, in blocks of seconds; see
+``alarm_budget``.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,7 @@ class PairDetector(Protocol):
 
 
 class JudgedPair(NamedTuple):
-    """How long a pair lasts, and the scores of its regions that pass the shape rule."""
+    """How long a pair lasts, and the scores of its regions labelled as motion at the lowest threshold."""
 
     seconds: float
     scores: tuple[float, ...]

@@ -204,9 +204,11 @@ ShapeRuleName = Literal["axis_aligned", "thickness", "oriented", "none"]
 
 
 class RegionConfig(FrozenConfig):
-    """From residual map to labelled regions; see ``regions.py`` for each step.
+    """From evidence to labelled regions; see ``regions`` and ``moving_regions`` for each step.
 
-    Fractions are of the image diagonal unless the name says otherwise; the residual is in gray levels 0-255.
+    Fractions are of the image diagonal unless the name says otherwise; the residual is in gray levels 0-255. Regions of
+    learned evidence (``moving_regions``) know ``min_motion_probability`` in place of ``threshold_mads``,
+    ``min_residual_gray``, smoothing, opening and closing.
     """
 
     texture_softening_gray: float = Field(

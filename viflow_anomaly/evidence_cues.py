@@ -4,8 +4,9 @@ None of the cues is the picture itself. The head learns on simulated scenes; wha
 like there. All cues are bounded to -1..1, so that nothing unheard of reaches the network from a real camera.
 
 Photometric cues are on every source pixel, geometric ones on blocks of 4x4: flow is smooth, and the measured one is no
-finer. Of the flow that is left between source and reconstruction, only what lies *across* the epipolar line is
-independent motion for sure; *along* it, a wrong depth looks the same.
+finer. Of the flow that is left between source and reconstruction, what one small motion of the camera explains is taken
+off (``motion_refinement``). Of the rest, only what lies *across* the epipolar line is independent motion for sure;
+*along* it, a wrong depth looks the same. Lines and parallax are those of a pinhole camera; a lens bends them a little.
 """
 
 from __future__ import annotations
@@ -41,13 +42,12 @@ GEOMETRIC_CUES = (
     "local flow along",
 )
 MIN_PARALLAX_PX = 0.05
-"""Below it an epipolar line has no direction; along is then along x."""
+"""Added to x of every slope, so that a line of no parallax lies along x; much longer slopes keep their direction. One
+of (-0.05, 0) px has neither line nor split flow."""
 HALF_GRAY, HALF_NORMALISED_GRAY, HALF_MISMATCH_GRAY = 16.0, 8.0, 8.0
 HALF_REMAINING_PX, HALF_PARALLAX_PX, HALF_FLOW_PX = 1.0, 4.0, 16.0
 HALF_TEXTURE_GRAY2 = 8.0
 """Values at which a cue is half of its largest: c = v / (|v| + half)."""
-
-
 MIN_INVERSE_DEPTH = 1e-3
 SIDE_MULTIPLE_PX = 32
 """Images are padded to multiples of it: the coarsest stride of the head."""
@@ -161,6 +161,7 @@ def _depth_on_blocks(
 
 
 def _epipolar_lines(slope_px: Float32Array) -> Line:
+    """Of slopes [h, w, 2] in source pixels; see ``MIN_PARALLAX_PX``."""
     x, y = slope_px[..., 0] + np.float32(MIN_PARALLAX_PX), slope_px[..., 1]
     length = np.sqrt(x * x + y * y)
     inverse = 1 / np.maximum(length, np.float32(1e-6))

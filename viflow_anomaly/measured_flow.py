@@ -26,6 +26,7 @@ PATCH_STRIDE_PX, DESCENT_STEPS = 6, 8
 """Patches of 8 px overlap by two, and few steps do, because the search starts near its end: a third less time than with
 the preset's 4 and 12 for the same corrected error on held-out sequences."""
 MAX_LOCAL_STEP_PX = 4.0
+"""Of the local refinement along x and along y: beyond it, gradients say nothing."""
 LOCAL_PRIOR_GRAY2 = 6.0
 """Added to the squared gradients: where there is no texture, nothing moves."""
 MIN_SIDE_PX = 32

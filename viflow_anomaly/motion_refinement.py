@@ -40,7 +40,8 @@ class MovedPoints(NamedTuple):
 
 
 class Line(NamedTuple):
-    """Unit vectors [h, w] along which a static point may move, and by how much it does as its depth says."""
+    """Unit vectors [h, w] along which a static point may move, and by how many pixels it does where its inverse depth
+    grows e times."""
 
     x: Float32Array
     y: Float32Array
@@ -50,7 +51,9 @@ class Line(NamedTuple):
 def common_motion_px(
     flow_px: Float32Array, trust: Float32Array, points: MovedPoints, line: Line, focal_px: tuple[float, float]
 ) -> Float32Array:
-    """The part of a remaining flow that a small motion of the camera explains, [h, w, 2] in source pixels.
+    """The part of a remaining flow that a small motion of the camera explains, [h, w, 2] float32 in source pixels.
+
+    One linear problem of six parameters, reweighted (Cauchy) ``ROUNDS`` times, on every ``LATTICE_BLOCKS``-th block.
 
     Args:
         flow_px: [h, w, 2] in source pixels.
@@ -91,6 +94,7 @@ def _solved(
     weights_along: Float32Array,
     prior: Float64Array,
 ) -> Float64Array:
+    """[6] rotation (rad) and translation: rows [6, N] and goals [N] in pixels, prior [6] inverse variances."""
     normal = np.diag(prior)
     gradient = np.zeros(6)
     for rows, goal, weights in ((rows_across, across, weights_across), (rows_along, along, weights_along)):

@@ -2,7 +2,7 @@
 
 The IMU's own faults come from ``motion_input``. Here the two images are looked at (is there texture, did the exposure
 jump, is one of them blurred, are they the same picture although the camera turned), and afterwards what the correction
-of the motion found (do the images confirm any motion of the camera, and is it the gyro's). Less than a millisecond.
+of the motion found (do the images confirm any motion of the camera, and is it the gyro's).
 """
 
 from __future__ import annotations

@@ -33,7 +33,6 @@ def labelled_regions(
     detector: AnomalyDetector,
     recordings: Sequence[Path],
     *,
-    every: int = 1,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> LabelledRegions:
     """The regions of labelled recordings that the head was not trained on, and which of them find a mover.
@@ -43,7 +42,6 @@ def labelled_regions(
     Args:
         detector: with the trained head.
         recordings: with masks of what moves.
-        every: take every n-th pair.
         on_progress: called with (done, total) after each recording.
 
     Raises:
@@ -53,7 +51,7 @@ def labelled_regions(
     moving: list[bool] = []
     for done, path in enumerate(recordings, start=1):
         pairs = SimulatedPairs(path)
-        for index in range(0, len(pairs), every):
+        for index in range(len(pairs)):
             try:
                 answer = detector.judge_cues(pairs.pair(index))
             except InvalidInputError:

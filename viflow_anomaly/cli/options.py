@@ -18,7 +18,7 @@ ConfigFile = Annotated[
 ]
 Assignments = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="One setting, e.g. detector.regions.threshold_mads=8. Repeatable."),
+    typer.Option("--set", metavar="KEY=VALUE", help="One setting, e.g. detector.regions.max_regions=8. Repeatable."),
 ]
 Checkpoint = Annotated[
     Path | None, typer.Option(metavar="PATH", help="Weights to use instead of the bundled model.", show_default=False)

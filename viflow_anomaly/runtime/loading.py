@@ -70,7 +70,7 @@ def load_evidence(
 ) -> LoadedEvidence:
     """Load an evidence head (None: the bundled one); arguments and errors as ``load_runtime``.
 
-    ``precision`` is OpenVINO's; torch computes in float32 on a CPU.
+    ``precision`` is OpenVINO's; torch computes in float32 on a CPU, with the threads that ``load_runtime`` gave it.
     """
     path = bundled_evidence_head() if path is None else path
     if not _takes_openvino(path, runtime, device):
