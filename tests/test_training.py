@@ -22,8 +22,9 @@ from viflow_anomaly import training_progress
 from viflow_anomaly.checkpoint import load_checkpoint, load_training_state, save_training_state
 from viflow_anomaly.config import ModelConfig, MotionWindowConfig, TrainingConfig, ViewConfig
 from viflow_anomaly.errors import CheckpointError, ConfigError, DatasetError
-from viflow_anomaly.training import TrainingRun, learning_rate, train
+from viflow_anomaly.training import TrainingRun, train
 from viflow_anomaly.training_data import TrainingData, load_training_data
+from viflow_anomaly.training_state import learning_rate
 
 WINDOW = MotionWindowConfig(samples_before=2, samples_between=4)
 MODEL = ModelConfig(preset="compact", hypotheses=4, view=ViewConfig(focal_px=80.0), motion_window=WINDOW)

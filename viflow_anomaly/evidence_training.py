@@ -14,13 +14,13 @@ import torch
 import torch.nn.functional as F  # noqa: N812  # torch's own convention
 from torch import nn
 
-from viflow_anomaly.checkpoint import load_training_state, save_training_state
+from viflow_anomaly.checkpoint import save_training_state
 from viflow_anomaly.config import EvidenceTrainingConfig
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.evidence_data import IGNORED, MOVING, SEAM, EvidenceBatch, EvidenceData
 from viflow_anomaly.model.evidence_builder import build_evidence_head
 from viflow_anomaly.model.evidence_head import EvidenceHead
-from viflow_anomaly.training_state import reached_step, require_same_run, restore_state, state_tensors
+from viflow_anomaly.training_state import learning_rate, resume_state, state_tensors
 
 Fingerprint = dict[str, object]
 
@@ -53,7 +53,7 @@ class EvidenceTraining:
     def train_step(self, batch: EvidenceBatch) -> float:
         """One optimiser step; its loss."""
         for group in self.optimizer.param_groups:
-            group["lr"] = _learning_rate(self.config, self.step)
+            group["lr"] = learning_rate(self.config, self.step)
         cues = (torch.from_numpy(one).to(self.device) for one in (batch.photometric, batch.geometric))
         logits = self.network(*(one.contiguous(memory_format=torch.channels_last) for one in cues))
         truth = torch.from_numpy(batch.truth).to(self.device)
@@ -81,19 +81,11 @@ class EvidenceTraining:
         save_training_state(folder, tensors, {"step": self.step, **fingerprint})
 
     def restore(self, folder: Path, fingerprint: Fingerprint) -> bool:
-        """Take up the state in ``folder``; False where there is none.
-
-        Raises:
-            ConfigError: ``resume_config_differs``.
-            CheckpointError: ``checkpoint_corrupt``.
-        """
-        loaded = load_training_state(folder)
-        if loaded is None:
+        """Take up the state in ``folder``; False where there is none. Errors as ``resume_state``."""
+        step = resume_state(self.network, self.optimizer, folder, fingerprint)
+        if step is None:
             return False
-        tensors, record = loaded
-        require_same_run(folder, record, fingerprint)
-        restore_state(self.network, self.optimizer, tensors, folder)
-        self.step = reached_step(record, folder)
+        self.step = step
         return True
 
 
@@ -118,11 +110,3 @@ def evidence_loss(
     dice = 1 - (2 * shared + 1) / (total + 1)
     seams = F.binary_cross_entropy_with_logits(logits[:, 1], seam, reduction="none", pos_weight=weight)
     return cross_entropy + 0.5 * dice + seam_weight * (seams * moving).sum() / moving.sum().clamp(min=1)
-
-
-def _learning_rate(config: EvidenceTrainingConfig, step: int) -> float:
-    """Linear warm-up, then half a cosine down to a hundredth."""
-    if step < config.warmup_steps:
-        return config.learning_rate * (step + 1) / config.warmup_steps
-    progress = (step - config.warmup_steps) / max(1, config.steps - config.warmup_steps)
-    return config.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(1.0, progress))))

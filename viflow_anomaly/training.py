@@ -30,7 +30,7 @@ from viflow_anomaly.runtime.torch_runtime import TorchRuntime
 from viflow_anomaly.training_data import TrainingData, load_training_data
 from viflow_anomaly.training_init import read_initial_weights
 from viflow_anomaly.training_progress import TrainingProgress
-from viflow_anomaly.training_state import reached_step, require_same_run, restore_state, state_tensors
+from viflow_anomaly.training_state import learning_rate, require_same_run, resume_state, state_tensors
 
 
 class TrainingRun:
@@ -123,28 +123,12 @@ class TrainingRun:
         save_training_state(folder, tensors, {"step": self.step, **fitted, **fingerprint})
 
     def restore(self, folder: Path, fingerprint: Mapping[str, Any]) -> bool:
-        """Take up the state in ``folder``; False where there is none.
-
-        Raises:
-            ConfigError: ``resume_config_differs``.
-            CheckpointError: ``checkpoint_corrupt``.
-        """
-        loaded = load_training_state(folder)
-        if loaded is None:
+        """Take up the state in ``folder``; False where there is none. Errors as ``resume_state``."""
+        step = resume_state(self.network, self.optimizer, folder, fingerprint)
+        if step is None:
             return False
-        tensors, record = loaded
-        require_same_run(folder, record, fingerprint)
-        restore_state(self.network, self.optimizer, tensors, folder)
-        self.step = reached_step(record, folder)
+        self.step = step
         return True
-
-
-def learning_rate(config: TrainingConfig, step: int) -> float:
-    """Linear warm-up, then half a cosine down to a hundredth."""
-    if step < config.warmup_steps:
-        return config.learning_rate * (step + 1) / config.warmup_steps
-    progress = (step - config.warmup_steps) / max(1, config.steps - config.warmup_steps)
-    return config.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(1.0, progress))))
 
 
 def train(

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import nn
 
+from viflow_anomaly.checkpoint import load_training_state
 from viflow_anomaly.errors import CheckpointError, ConfigError
 
 
@@ -22,14 +24,10 @@ def state_tensors(network: nn.Module, optimizer: torch.optim.Optimizer) -> dict[
     return tensors
 
 
-def restore_state(
+def _restore(
     network: nn.Module, optimizer: torch.optim.Optimizer, tensors: Mapping[str, torch.Tensor], folder: Path
 ) -> None:
-    """Take up what ``state_tensors`` gave.
-
-    Raises:
-        CheckpointError: ``checkpoint_corrupt``, with ``folder`` in its text.
-    """
+    """Take up what ``state_tensors`` gave."""
     try:
         network.load_state_dict(_below(tensors, "model."))
         _restore_optimizer(network, optimizer, _below(tensors, "optimizer."))
@@ -41,12 +39,46 @@ def restore_state(
         ) from err
 
 
-def reached_step(record: Mapping[str, Any], folder: Path) -> int:
-    """The step that a saved training had reached.
+class Schedule(Protocol):
+    """What the learning rate of a step depends on."""
+
+    @property
+    def learning_rate(self) -> float: ...
+
+    @property
+    def warmup_steps(self) -> int: ...
+
+    @property
+    def steps(self) -> int: ...
+
+
+def learning_rate(config: Schedule, step: int) -> float:
+    """Linear warm-up, then half a cosine down to a hundredth."""
+    if step < config.warmup_steps:
+        return config.learning_rate * (step + 1) / config.warmup_steps
+    progress = (step - config.warmup_steps) / max(1, config.steps - config.warmup_steps)
+    return config.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(1.0, progress))))
+
+
+def resume_state(
+    network: nn.Module, optimizer: torch.optim.Optimizer, folder: Path, fingerprint: Mapping[str, Any]
+) -> int | None:
+    """Take up the state in ``folder``; the step that it had reached, None where there is none.
 
     Raises:
+        ConfigError: ``resume_config_differs``.
         CheckpointError: ``checkpoint_corrupt``.
     """
+    loaded = load_training_state(folder)
+    if loaded is None:
+        return None
+    tensors, record = loaded
+    require_same_run(folder, record, fingerprint)
+    _restore(network, optimizer, tensors, folder)
+    return _reached_step(record, folder)
+
+
+def _reached_step(record: Mapping[str, Any], folder: Path) -> int:
     step = record.get("step")
     if not isinstance(step, int):
         raise CheckpointError(
