@@ -9,7 +9,6 @@ that a user would see after changing this one setting.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read once, when torch loa
 
 import cv2
 
-from viflow_anomaly.checkpoint_record import write_atomically
 from viflow_anomaly.config import DetectorConfig
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.evaluation.detection_methods import DetectorMethod
@@ -28,6 +26,7 @@ from viflow_anomaly.evaluation.detection_tables import notes
 from viflow_anomaly.evaluation.flow_report import ALL, scopes
 from viflow_anomaly.evaluation.flow_tables import Table, markdown_table, number_text
 from viflow_anomaly.evaluation.labelled_pairs import open_labelled
+from viflow_anomaly.evaluation.report_files import write_report
 
 RESULTS = Path("benchmarks/results/detection-ablations")
 DEFAULT = "default"
@@ -127,8 +126,7 @@ def main() -> None:
     names = [name for name in VARIANTS if not arguments.only or name in (DEFAULT, *arguments.only)]
     report = measure(arguments.recordings, arguments.checkpoint, arguments.every, names)
     text = markdown(report)
-    write_atomically(arguments.out.with_suffix(".json"), (json.dumps(report, indent=2) + "\n").encode())
-    write_atomically(arguments.out.with_suffix(".md"), text.encode())
+    write_report(arguments.out, report, text)
     print(text)
 
 

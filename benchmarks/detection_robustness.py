@@ -13,7 +13,6 @@ The goal: with the correction, an offset of 5 ms or 1 degree of mounting costs a
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 from collections.abc import Sequence
@@ -22,7 +21,6 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read once, when torch loads
 
-from viflow_anomaly.checkpoint_record import write_atomically
 from viflow_anomaly.cli.options import load_detector
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.evaluation.detection_methods import DetectorMethod
@@ -38,6 +36,7 @@ from viflow_anomaly.evaluation.perturbed_pairs import (
     UNPERTURBED,
     PerturbedPairs,
 )
+from viflow_anomaly.evaluation.report_files import write_report
 from viflow_anomaly.settings import resolve_settings
 
 RESULTS = Path("benchmarks/results/detection-robustness")
@@ -160,8 +159,7 @@ def main() -> None:
     sequences = [open_labelled(path) for path in arguments.recordings]
     report = measure(load_detector(settings), sequences, arguments.every, names)
     text = markdown(report)
-    write_atomically(arguments.out.with_suffix(".json"), (json.dumps(report, indent=2) + "\n").encode())
-    write_atomically(arguments.out.with_suffix(".md"), text.encode())
+    write_report(arguments.out, report, text)
     print(text)
 
 

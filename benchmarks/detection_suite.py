@@ -13,7 +13,6 @@ have 900000 and 950000 on. These have 910000 (drone) and 960000 (car) on, a hund
 from __future__ import annotations
 
 import argparse
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +22,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read once, when torch loa
 
 import cv2
 
-from viflow_anomaly.checkpoint_record import write_atomically
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.evaluation.detection_methods import OURS, DetectionMethod, DetectorMethod, rival_methods
 from viflow_anomaly.evaluation.detection_plots import draw_detection_figures
@@ -31,6 +29,7 @@ from viflow_anomaly.evaluation.detection_quality import measure_detection
 from viflow_anomaly.evaluation.detection_report import detection_report
 from viflow_anomaly.evaluation.detection_tables import markdown
 from viflow_anomaly.evaluation.labelled_pairs import SimulatedPairs
+from viflow_anomaly.evaluation.report_files import write_report
 from viflow_anomaly.simulator import simulate
 from viflow_anomaly.simulator.config import SimulatorConfig
 
@@ -102,8 +101,7 @@ def main() -> None:
     arguments = parser.parse_args()
     report = measure(arguments)
     text = markdown(report, title="Detection suite: simulated sequences of fixed seeds")
-    write_atomically(arguments.out.with_suffix(".json"), (json.dumps(report, indent=2) + "\n").encode())
-    write_atomically(arguments.out.with_suffix(".md"), text.encode())
+    write_report(arguments.out, report, text)
     if arguments.plots is not None:
         draw_detection_figures(arguments.plots, report)
     print(text)

@@ -29,8 +29,7 @@ from viflow_anomaly.errors import ViflowError
 from viflow_anomaly.evaluation.flow_methods import network_methods
 from viflow_anomaly.evaluation.flow_report import circumstances
 from viflow_anomaly.evaluation.flow_truth import PairName
-from viflow_anomaly.geometry import pixel_grid
-from viflow_anomaly.residual import photometric_residual, reconstruct
+from viflow_anomaly.evaluation.photometric_error import photometric_error
 from viflow_anomaly.runtime.loading import load_runtime
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -79,12 +78,9 @@ def flight(recording: Path, named: dict[str, Path]) -> dict[str, Any]:
                 except (ViflowError, RuntimeError):
                     failed += 1
                     continue
-                shown = np.isfinite(flow).all(axis=-1)
-                at_px = np.where(shown[..., None], flow, 0).astype(np.float32) + pixel_grid(*shown.shape)
-                reconstruction, inside = reconstruct(pair.target.image, at_px)
-                judged = inside & shown
-                residuals.append(float(photometric_residual(pair.source.image, reconstruction, judged)[judged].mean()))
-                identities.append(float(cv2.absdiff(pair.source.image, pair.target.image)[judged].mean()))
+                error = photometric_error(pair, flow)
+                residuals.append(error.residual_gray)
+                identities.append(error.frame_difference_gray)
             found[method.about.name] = {
                 "pairs": len(residuals),
                 "failed": failed,

@@ -25,7 +25,6 @@ beside it. Seeds: 911000 (drone) and 961000 (car) on, which no training and no o
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 from collections import Counter
@@ -36,7 +35,6 @@ from typing import Any, NamedTuple
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read once, when torch loads
 
-from viflow_anomaly.checkpoint_record import write_atomically
 from viflow_anomaly.cli.options import load_detector
 from viflow_anomaly.config import MotorSource
 from viflow_anomaly.datasets.pairing import RecordingPairs
@@ -46,6 +44,7 @@ from viflow_anomaly.errors import InvalidInputError
 from viflow_anomaly.evaluation.candidate_alarms import GOAL_SHARE, CandidateCounts, count_candidates, plain_config
 from viflow_anomaly.evaluation.flow_report import ALL, circumstances
 from viflow_anomaly.evaluation.flow_tables import Table, markdown_table, number_text
+from viflow_anomaly.evaluation.report_files import write_report
 from viflow_anomaly.sensor_data import FramePair
 from viflow_anomaly.settings import resolve_settings
 from viflow_anomaly.simulator import simulate
@@ -192,8 +191,7 @@ def main() -> None:
     )
     report = measure(load_detector(settings), arguments, arguments.only or list(SCENARIOS))
     text = markdown(report)
-    write_atomically(arguments.out.with_suffix(".json"), (json.dumps(report, indent=2) + "\n").encode())
-    write_atomically(arguments.out.with_suffix(".md"), text.encode())
+    write_report(arguments.out, report, text)
     print(text)
 
 

@@ -15,9 +15,10 @@ from fastapi.responses import JSONResponse
 from starlette.requests import ClientDisconnect
 
 from viflow_anomaly.detection import SCHEMA_VERSION, load_detection_schema
+from viflow_anomaly.pair_detector import PairDetector
 from viflow_anomaly_service.admission import AdmissionGate
 from viflow_anomaly_service.detection_request import answer_request
-from viflow_anomaly_service.detector_slot import DetectorSlot, PairDetector
+from viflow_anomaly_service.detector_slot import DetectorSlot
 from viflow_anomaly_service.openapi import (
     HEALTH_RESPONSES,
     READY_RESPONSES,

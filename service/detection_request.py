@@ -18,8 +18,8 @@ from viflow_anomaly.detection import to_json
 from viflow_anomaly.errors import InvalidInputError, TooLargeError, ViflowError
 from viflow_anomaly.images import decode_image
 from viflow_anomaly.motor_input import require_supported
+from viflow_anomaly.pair_detector import PairDetector
 from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples
-from viflow_anomaly_service.detector_slot import PairDetector
 from viflow_anomaly_service.form_body import parse_form
 from viflow_anomaly_service.json_body import parse_json
 from viflow_anomaly_service.problems import Problem, problem_of_error, problem_of_validation

@@ -5,44 +5,12 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from typing import Any, Protocol, Self
+from typing import Any
 
-from viflow_anomaly.config import DetectorConfig, MotorSource
-from viflow_anomaly.detection import Detection
-from viflow_anomaly.sensor_data import FramePair
+from viflow_anomaly.pair_detector import PairDetector
 from viflow_anomaly_service.problems import Problem
 
 logger = logging.getLogger(__name__)
-
-
-class ModelIdentity(Protocol):
-    """Which weights answer."""
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def version(self) -> str: ...
-
-    @property
-    def sha256(self) -> str: ...
-
-
-class PairDetector(Protocol):
-    """What the service needs of ``viflow_anomaly.detector.AnomalyDetector``; ``detect`` is called from many threads."""
-
-    @property
-    def model_info(self) -> ModelIdentity: ...
-
-    @property
-    def config(self) -> DetectorConfig: ...
-
-    @property
-    def motor_source(self) -> MotorSource | None: ...
-
-    def with_config(self, config: DetectorConfig) -> Self: ...
-
-    def detect(self, pair: FramePair, *, decode_ms: float = 0.0) -> Detection: ...
 
 
 class DetectorSlot:

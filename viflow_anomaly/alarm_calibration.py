@@ -14,7 +14,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, Protocol, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 from pydantic import AwareDatetime, Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
@@ -24,6 +24,7 @@ from viflow_anomaly.checkpoint_record import source_commit, write_atomically
 from viflow_anomaly.config import DetectorConfig, FrozenConfig
 from viflow_anomaly.detection import ModelInfo
 from viflow_anomaly.errors import ConfigError
+from viflow_anomaly.pair_detector import PairDetector
 
 SCHEMA_VERSION = "1.0"
 MAX_FILE_BYTES = 4 * 1024 * 1024
@@ -31,19 +32,7 @@ ABSENT = "nothing"
 _SIGNIFICANT_DIGITS = 6
 
 
-class Detector(Protocol):
-    """What a calibration is applied to, ``viflow_anomaly.detector.AnomalyDetector``."""
-
-    @property
-    def model_info(self) -> ModelInfo: ...
-
-    @property
-    def config(self) -> DetectorConfig: ...
-
-    def with_config(self, config: DetectorConfig) -> Self: ...
-
-
-AnyDetector = TypeVar("AnyDetector", bound=Detector)
+AnyDetector = TypeVar("AnyDetector", bound=PairDetector)
 
 
 class CalibratedModel(FrozenConfig):
@@ -206,7 +195,7 @@ def calibrated(detector: AnyDetector, path: Path | None) -> AnyDetector:
     return detector.with_config(detector.config.model_copy(update={"regions": regions}))
 
 
-def require_current(calibration: AlarmCalibration, detector: Detector, *, where: Path) -> None:
+def require_current(calibration: AlarmCalibration, detector: PairDetector, *, where: Path) -> None:
     """Nothing, where the scores of ``detector`` are those that the calibration was made of.
 
     Raises:

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,31 +15,14 @@ from viflow_anomaly.alarm_budget import LOWEST_THRESHOLD, ScoredFootage
 from viflow_anomaly.config import DetectorConfig, MotorSource
 from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.datasets.recording import Recording
-from viflow_anomaly.detection import Detection, ModelInfo
+from viflow_anomaly.detection import Detection
 from viflow_anomaly.errors import DatasetError, InvalidInputError, ViflowError
-from viflow_anomaly.sensor_data import FramePair
+from viflow_anomaly.pair_detector import PairDetector
 
 SECONDS_PER_HOUR = 3600.0
 DEFAULT_BLOCK_S = 10.0
 MIN_BLOCKS = 20
 """Fewer say too little of how alarms clump."""
-
-
-class PairDetector(Protocol):
-    """What is needed of ``viflow_anomaly.detector.AnomalyDetector``."""
-
-    @property
-    def model_info(self) -> ModelInfo: ...
-
-    @property
-    def config(self) -> DetectorConfig: ...
-
-    @property
-    def motor_source(self) -> MotorSource | None: ...
-
-    def with_config(self, config: DetectorConfig) -> Self: ...
-
-    def detect(self, pair: FramePair, *, decode_ms: float = 0.0) -> Detection: ...
 
 
 class JudgedPair(NamedTuple):

@@ -39,12 +39,13 @@ from viflow_anomaly.batch_record import (
 )
 from viflow_anomaly.batch_rig import RigJournal
 from viflow_anomaly.batch_tracking import tracked_lines
-from viflow_anomaly.config import DetectorConfig, FrozenConfig, MotorSource, RigEstimateConfig, TrackingConfig
+from viflow_anomaly.config import FrozenConfig, RigEstimateConfig, TrackingConfig
 from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.datasets.recording import Recording
-from viflow_anomaly.detection import Detection, ModelInfo, to_json
+from viflow_anomaly.detection import Detection, to_json
 from viflow_anomaly.detection_reading import detection_from_json
 from viflow_anomaly.errors import DatasetError, InvalidInputError, ViflowError
+from viflow_anomaly.pair_detector import DetectorIdentity
 from viflow_anomaly.rig_estimate import RigEstimate, corrected_pair, observe, update
 from viflow_anomaly.sensor_data import FramePair
 from viflow_anomaly.tracking import Tracker, TrackingState
@@ -68,17 +69,8 @@ class BatchOptions(FrozenConfig):
     overwrite: bool = False
 
 
-class PairDetector(Protocol):
+class PairAnalyzer(DetectorIdentity, Protocol):
     """What a batch run needs of ``viflow_anomaly.detector.AnomalyDetector``."""
-
-    @property
-    def model_info(self) -> ModelInfo: ...
-
-    @property
-    def config(self) -> DetectorConfig: ...
-
-    @property
-    def motor_source(self) -> MotorSource | None: ...
 
     def analyze(self, pair: FramePair, *, decode_ms: float = 0.0) -> PairAnalysis: ...
 
@@ -89,7 +81,7 @@ OnProgress = Callable[[int, int, int], None]
 
 def run_batch(
     recording: Recording,
-    detector: PairDetector,
+    detector: PairAnalyzer,
     options: BatchOptions,
     *,
     settings: Mapping[str, Any] | None = None,
@@ -155,7 +147,7 @@ class _Job:
     """The parts of one run."""
 
     pairs: RecordingPairs
-    detector: PairDetector
+    detector: PairAnalyzer
     journal: Journal
     rig: RigJournal
     pictures: Pictures
@@ -164,7 +156,7 @@ class _Job:
 
     @classmethod
     def of(
-        cls, pairs: RecordingPairs, count: int, detector: PairDetector, options: BatchOptions, journal: Journal
+        cls, pairs: RecordingPairs, count: int, detector: PairAnalyzer, options: BatchOptions, journal: Journal
     ) -> Self:
         rig = RigJournal(options.out_dir / RIG_NAME)
         stamps = map(pairs.stamps, range(count))

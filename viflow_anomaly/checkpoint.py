@@ -94,12 +94,7 @@ def load_evidence_head(path: Path | None = None) -> LoadedEvidenceHead:
     path = bundled_evidence_head() if path is None else path
     data, record = read_tensors(path, EvidenceRecord)
     head = build_evidence_head(record.head)
-    try:
-        head.load_state_dict(load_tensors(data))
-    except (SafetensorError, RuntimeError) as err:
-        raise corrupt_checkpoint(
-            path, f"expected the tensors of the head in its .json, found: {_one_line(err)}"
-        ) from err
+    _load_into(head, data, path, of="head")
     return LoadedEvidenceHead(head.eval(), record)
 
 
@@ -115,13 +110,17 @@ def load_checkpoint(path: Path | None = None) -> LoadedCheckpoint:
         model = build_model(record.model)
     except ConfigError as err:
         raise invalid_record(path.with_suffix(".json"), err.message) from err
+    _load_into(model, data, path, of="model")
+    return LoadedCheckpoint(model.eval(), record)
+
+
+def _load_into(network: nn.Module, data: bytes, path: Path, *, of: str) -> None:
     try:
-        model.load_state_dict(load_tensors(data))
+        network.load_state_dict(load_tensors(data))
     except (SafetensorError, RuntimeError) as err:
         raise corrupt_checkpoint(
-            path, f"expected the tensors of the model in its .json, found: {_one_line(err)}"
+            path, f"expected the tensors of the {of} in its .json, found: {_one_line(err)}"
         ) from err
-    return LoadedCheckpoint(model.eval(), record)
 
 
 def _one_line(err: Exception) -> str:

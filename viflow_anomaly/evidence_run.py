@@ -14,12 +14,13 @@ from viflow_anomaly.batch import require_device
 from viflow_anomaly.checkpoint import save_evidence_head
 from viflow_anomaly.checkpoint_record import BUNDLED_EVIDENCE_NAME, EvidenceRecord, source_commit
 from viflow_anomaly.config import EvidenceTrainingConfig
+from viflow_anomaly.detection import ModelInfo
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.evaluation.labelled_pairs import SimulatedPairs
 from viflow_anomaly.evidence_cues import GEOMETRIC_CUES, PHOTOMETRIC_CUES
 from viflow_anomaly.evidence_data import EvidenceData, load_examples
-from viflow_anomaly.evidence_training import EvidenceTraining
+from viflow_anomaly.evidence_training import EvidenceTraining, Fingerprint
 from viflow_anomaly.region_score_fit import fit_region_score, labelled_regions
 from viflow_anomaly.runtime.loading import LoadedEvidence
 from viflow_anomaly.runtime.torch_evidence import TorchEvidence
@@ -65,20 +66,10 @@ def train_evidence(
     _require_apart(data, calibration)
     for path in calibration:
         SimulatedPairs(path)  # what is wrong with one should be told before the training, not after it
-    if out_dir.exists() and not out_dir.is_dir():
-        raise ConfigError(
-            f"{out_dir}: expected a directory or nothing, found a file", code="output_unusable", field="out"
-        )
-    if (out_dir / "state.safetensors").exists() and not resume:
-        raise ConfigError(
-            f"{out_dir}: expected a directory without a training run, found one; --resume goes on with it",
-            code="training_exists",
-            field="out",
-        )
+    _require_usable(out_dir, resume=resume)
     torch.set_num_threads(training.threads)
-    model = detector.model_info
-    fingerprint: dict[str, Any] = {
-        "model": model.sha256,
+    fingerprint: Fingerprint = {
+        "model": detector.model_info.sha256,
         "evidence_training": training.model_dump(mode="json", exclude={"checkpoint_every"}),
         "data": [path.name for path in data],
     }
@@ -92,20 +83,34 @@ def train_evidence(
             every=training.every,
             on_progress=lambda done, total: report("reading", done, total),
         )
+        _run_steps(run, EvidenceData(examples, training), out_dir, fingerprint, report)
+    record = _record(training, detector.model_info, data, calibration)
+    return _with_scores(run, record, out_dir / "evidence.safetensors", detector, calibration, report)
 
-        losses: list[float] = []
 
-        def on_step(step: int, loss: float) -> None:
-            report(f"training, loss {loss:.3f}", step, training.steps)
-            losses.append(loss)
-            if step % LOG_EVERY == 0:
-                _log(out_dir / "metrics.jsonl", step, sum(losses) / len(losses))
-                losses.clear()
-            if step % training.checkpoint_every == 0 or step == training.steps:
-                run.save(out_dir, fingerprint)
+def _run_steps(
+    run: EvidenceTraining, data: EvidenceData, out_dir: Path, fingerprint: Fingerprint, report: Report
+) -> None:
+    """All steps that are left, logged and saved as they go."""
+    losses: list[float] = []
 
-        run.run(EvidenceData(examples, training), on_step)
-    record = EvidenceRecord(
+    def on_step(step: int, loss: float) -> None:
+        report(f"training, loss {loss:.3f}", step, run.config.steps)
+        losses.append(loss)
+        if step % LOG_EVERY == 0:
+            _log(out_dir / "metrics.jsonl", step, sum(losses) / len(losses))
+            losses.clear()
+        if step % run.config.checkpoint_every == 0 or step == run.config.steps:
+            run.save(out_dir, fingerprint)
+
+    run.run(data, on_step)
+
+
+def _record(
+    training: EvidenceTrainingConfig, model: ModelInfo, data: Sequence[Path], calibration: Sequence[Path]
+) -> EvidenceRecord:
+    """What the head is; its checksum and scores are not known yet."""
+    return EvidenceRecord(
         name=BUNDLED_EVIDENCE_NAME,
         version=__version__,
         sha256="0" * 64,
@@ -116,11 +121,27 @@ def train_evidence(
             "commit": source_commit(),
             "training": training.model_dump(mode="json"),
             "model": {"name": model.name, "version": model.version, "sha256": model.sha256},
-            "data": {"recordings": len(data), "first": data[0].name, "last": data[-1].name},
-            "calibration": {"recordings": len(calibration), "first": calibration[0].name, "last": calibration[-1].name},
+            "data": _told(data),
+            "calibration": _told(calibration),
         },
     )
-    return _with_scores(run, record, out_dir / "evidence.safetensors", detector, calibration, report)
+
+
+def _told(recordings: Sequence[Path]) -> dict[str, Any]:
+    return {"recordings": len(recordings), "first": recordings[0].name, "last": recordings[-1].name}
+
+
+def _require_usable(out_dir: Path, *, resume: bool) -> None:
+    if out_dir.exists() and not out_dir.is_dir():
+        raise ConfigError(
+            f"{out_dir}: expected a directory or nothing, found a file", code="output_unusable", field="out"
+        )
+    if (out_dir / "state.safetensors").exists() and not resume:
+        raise ConfigError(
+            f"{out_dir}: expected a directory without a training run, found one; --resume goes on with it",
+            code="training_exists",
+            field="out",
+        )
 
 
 def _log(path: Path, step: int, loss: float) -> None:

@@ -24,6 +24,7 @@ from viflow_anomaly.regions import (
     Region,
     largest_components,
     pixels_of,
+    region_of,
     shape_limits,
 )
 from viflow_anomaly.sensor_data import Float64Array
@@ -137,19 +138,8 @@ def _judge(measured: MeasuredRegion, residual: Float32Array, score: RegionScore,
         probability = min(probability, BAND_SCORE)
     moves = shape.passes and probability >= config.motion_score
     values = residual[component.y, component.x]
-    return Region(
-        label="independent_motion" if moves else "model_error",
-        score=probability,
-        bbox=box,
-        x_extent_px=box.width,
-        y_extent_px=box.height,
-        area_px=int(values.size),
-        thickness_px=thickness,
-        residual_mean=float(values.mean()),
-        residual_max=float(values.max()),
-        evidence=_evidence(features, shape, box.width / box.height, config),
-        mask=outline,
-    )
+    evidence = _evidence(features, shape, box.width / box.height, config)
+    return region_of(values, box, outline, moves=moves, score=probability, thickness_px=thickness, evidence=evidence)
 
 
 def _labels(mask: BoolArray, seam_logit: Float32Array) -> IndexArray:

@@ -245,24 +245,39 @@ def _judge(
     thickness = thickness_px(mask)
     shape = judge_shape(config.shape_rule, mask, thickness, limits)
     score = _score(shape.passes, contrast, fill_ratio, shape.nearness_to_band)
-    label: RegionLabel = "independent_motion" if shape.passes and score >= config.motion_score else "model_error"
+    reasons: dict[str, float | str] = {
+        "rule": shape.verdict,
+        "contrast": contrast,
+        "threshold_gray": level.threshold_gray,
+        "fill_ratio": fill_ratio,
+        "aspect_ratio": aspect_ratio,
+    }
+    moves = shape.passes and score >= config.motion_score
+    return region_of(values, box, mask, moves=moves, score=score, thickness_px=thickness, evidence=reasons)
+
+
+def region_of(
+    residual: Float32Array,
+    box: BoundingBox,
+    mask: BoolArray,
+    *,
+    moves: bool,
+    score: float,
+    thickness_px: float,
+    evidence: dict[str, float | str],
+) -> Region:
+    """A judged region; ``residual`` [n] is that of its pixels, ``mask`` that of its box."""
     return Region(
-        label=label,
+        label="independent_motion" if moves else "model_error",
         score=score,
         bbox=box,
         x_extent_px=box.width,
         y_extent_px=box.height,
-        area_px=int(values.size),
-        thickness_px=thickness,
-        residual_mean=float(values.mean()),
-        residual_max=float(values.max()),
-        evidence={
-            "rule": shape.verdict,
-            "contrast": contrast,
-            "threshold_gray": level.threshold_gray,
-            "fill_ratio": fill_ratio,
-            "aspect_ratio": aspect_ratio,
-        },
+        area_px=int(residual.size),
+        thickness_px=thickness_px,
+        residual_mean=float(residual.mean()),
+        residual_max=float(residual.max()),
+        evidence=evidence,
         mask=mask,
     )
 

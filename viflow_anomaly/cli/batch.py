@@ -23,7 +23,7 @@ from viflow_anomaly.cli.options import (
 from viflow_anomaly.cli.progress import stderr_progress
 
 if TYPE_CHECKING:
-    from viflow_anomaly.batch_job import BatchOptions, PairDetector
+    from viflow_anomaly.batch_job import BatchOptions, PairAnalyzer
     from viflow_anomaly.batch_record import BatchSummary
     from viflow_anomaly.datasets.recording import Recording
 
@@ -135,7 +135,7 @@ def default_out_dir(directory: Path) -> Path:
     return whole.with_name(f"{whole.name}-detections")
 
 
-def _run(recording: Recording, detector: PairDetector, options: BatchOptions, recorded: dict[str, Any]) -> BatchSummary:
+def _run(recording: Recording, detector: PairAnalyzer, options: BatchOptions, recorded: dict[str, Any]) -> BatchSummary:
     from viflow_anomaly.batch_job import run_batch
 
     with stderr_progress() as progress:

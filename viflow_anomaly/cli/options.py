@@ -35,6 +35,12 @@ Threads = Annotated[
         min=1, help="CPU threads of one pair. 1 (default) answers soonest wherever other programs run.", metavar="N"
     ),
 ]
+Steps = Annotated[int | None, typer.Option(min=1, help="Training steps.")]
+Seed = Annotated[int | None, typer.Option(min=0, help="Fixes everything on a CPU.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint in --out.")]
+TrainingThreads = Annotated[
+    int | None, typer.Option(min=1, metavar="N", help="CPU threads; another number gives other weights (default 1).")
+]
 Device = Annotated[str | None, typer.Option(metavar="DEVICE", help="cpu (default), cuda, cuda:1, ...")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on stdout, and nothing else there.")]
 

@@ -8,7 +8,16 @@ from typing import Annotated
 
 import typer
 
-from viflow_anomaly.cli.options import Assignments, ConfigFile, Device, settings_from
+from viflow_anomaly.cli.options import (
+    Assignments,
+    ConfigFile,
+    Device,
+    Resume,
+    Seed,
+    Steps,
+    TrainingThreads,
+    settings_from,
+)
 from viflow_anomaly.config import FINE_TUNING_DEFAULTS
 
 BUNDLED = Path("default")
@@ -29,14 +38,11 @@ def train(
     validation: Annotated[
         list[Path] | None, typer.Option(metavar="DIR", help="A recording to measure on, never to train on. Repeatable.")
     ] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Training steps.")] = None,
+    steps: Steps = None,
     batch_size: Annotated[int | None, typer.Option(min=1, help="Frame pairs in a step.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Fixes everything on a CPU.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint in --out.")] = False,
-    threads: Annotated[
-        int | None,
-        typer.Option(min=1, metavar="N", help="CPU threads; another number gives other weights (default 1)."),
-    ] = None,
+    seed: Seed = None,
+    resume: Resume = False,
+    threads: TrainingThreads = None,
     device: Device = None,
     config: ConfigFile = None,
     assignments: Assignments = None,

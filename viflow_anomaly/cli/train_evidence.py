@@ -7,7 +7,18 @@ from typing import Annotated
 
 import typer
 
-from viflow_anomaly.cli.options import Assignments, Checkpoint, ConfigFile, Device, load_detector, settings_from
+from viflow_anomaly.cli.options import (
+    Assignments,
+    Checkpoint,
+    ConfigFile,
+    Device,
+    Resume,
+    Seed,
+    Steps,
+    TrainingThreads,
+    load_detector,
+    settings_from,
+)
 from viflow_anomaly.cli.progress import stderr_progress
 from viflow_anomaly.errors import DatasetError
 
@@ -21,13 +32,10 @@ def train_evidence(
         list[Path],
         typer.Option(metavar="DIR", help="A folder of recordings to fit the scores on, never to train on. Repeatable."),
     ],
-    steps: Annotated[int | None, typer.Option(min=1, help="Training steps.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Fixes everything on a CPU.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint in --out.")] = False,
-    threads: Annotated[
-        int | None,
-        typer.Option(min=1, metavar="N", help="CPU threads; another number gives other weights (default 1)."),
-    ] = None,
+    steps: Steps = None,
+    seed: Seed = None,
+    resume: Resume = False,
+    threads: TrainingThreads = None,
     checkpoint: Checkpoint = None,
     device: Device = None,
     config: ConfigFile = None,
