@@ -108,6 +108,13 @@ def test_what_is_not_known_cannot_be_made_wrong() -> None:
     assert caught.value.code == "camera_missing"
 
 
+def test_without_accelerometer_the_gyro_stays() -> None:
+    pair = ramp_pair(camera())
+    seen = perturbed.drop_accelerometer(pair)
+    assert seen.imu.accel_m_s2 is None
+    np.testing.assert_array_equal(seen.imu.gyro_rad_s, pair.imu.gyro_rad_s)
+
+
 def test_every_perturbation_but_one_changes_the_pair() -> None:
     pair = ramp_pair(camera())
     for name, perturb in PERTURBATIONS.items():

@@ -64,6 +64,11 @@ def bias_gyro(pair: FramePair, *, by_rad_s: float) -> FramePair:
     return replace(pair, imu=replace(pair.imu, gyro_rad_s=pair.imu.gyro_rad_s + by_rad_s))
 
 
+def drop_accelerometer(pair: FramePair) -> FramePair:
+    """The gyro alone, as of a phone or a stabiliser."""
+    return replace(pair, imu=replace(pair.imu, accel_m_s2=None))
+
+
 def scale_focal_length(pair: FramePair, *, factor: float) -> FramePair:
     """The camera is said to have a longer (> 1) or shorter focal length than it has.
 
@@ -112,6 +117,7 @@ PERTURBATIONS: Final = MappingProxyType[str, Perturbation](
         "mounting 1 deg about y (down)": partial(turn_mounting, axis=1, by_rad=ONE_DEGREE),
         "mounting 1 deg about z (ahead)": partial(turn_mounting, axis=2, by_rad=ONE_DEGREE),
         "gyro bias 0.02 rad/s": partial(bias_gyro, by_rad_s=0.02),
+        "no accelerometer": drop_accelerometer,
         "focal length +2 %": partial(scale_focal_length, factor=1.02),
         "focal length -2 %": partial(scale_focal_length, factor=0.98),
         "image noise sigma 5": partial(add_image_noise, sigma_gray=5.0),
