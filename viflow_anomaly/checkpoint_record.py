@@ -61,12 +61,14 @@ class EvidenceRecord(TensorRecord):
     Attributes:
         head: what the builder needs.
         photometric_cues, geometric_cues: their names, in the order that the head was trained on.
+        cues_version: of the cues' arithmetic, ``evidence_cues.CUES_VERSION``.
         region_score: how what is found becomes a probability, fitted after the training.
     """
 
     head: EvidenceHeadConfig
     photometric_cues: tuple[str, ...]
     geometric_cues: tuple[str, ...]
+    cues_version: int = 1
     region_score: RegionScore = RegionScore()
 
 

@@ -9,6 +9,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from viflow_anomaly.alignment import AlignedPair, align
 from viflow_anomaly.checkpoint_record import CheckpointRecord
 from viflow_anomaly.config import DetectorConfig, MotorSource, Precision, RuntimeName
 from viflow_anomaly.detection import (
@@ -196,7 +197,7 @@ class AnomalyDetector:
         """``detect`` with its maps; same errors. The paper's algorithm on one screen."""
         started = time.perf_counter()
         explained = self._explain(pair)
-        judged = self._judged_cues(explained)
+        explained, judged = self._judge(pair, explained)
         model_input, predicted = explained.model_input, explained.predicted
         residual, inside = explained.residual, explained.inside
         inferred = time.perf_counter()
@@ -248,23 +249,23 @@ class AnomalyDetector:
         Raises:
             InvalidInputError: as ``detect``.
         """
-        explained = self._explain(pair)
-        judged = self._judged_cues(explained)
+        explained, judged = self._judge(pair, self._explain(pair))
         return None if judged is None else (judged, explained.inside)
 
     def cues(self, pair: FramePair) -> tuple[EvidenceCues, NDArray[np.bool_]]:
         """What the evidence head is shown of a pair, and which pixels [H, W] are inside; errors as ``detect``."""
-        explained = self._explain(pair)
-        return self._cues(explained), explained.inside
+        aligned = self._align(pair, self._explain(pair))
+        return evidence_cues(aligned), aligned.explained.inside
 
-    def _cues(self, explanation: Explanation) -> EvidenceCues:
-        return evidence_cues(explanation, focal_px=self._record.model.view.focal_px)
+    def _align(self, pair: FramePair, explained: Explanation) -> AlignedPair:
+        return align(pair, explained, self.config, focal_px=self._record.model.view.focal_px)
 
-    def _judged_cues(self, explanation: Explanation) -> JudgedCues | None:
-        """What the head makes of it; None: regions are found in the residual."""
-        if self._evidence is None or not takes_head(self._evidence, explanation, self.config):
-            return None
-        return judge_cues(self._evidence, self._cues(explanation), explanation)
+    def _judge(self, pair: FramePair, explained: Explanation) -> tuple[Explanation, JudgedCues | None]:
+        """The pair aligned, and what the head makes of it; as it was and None: regions are found in the residual."""
+        if self._evidence is None or not takes_head(self._evidence, explained, self.config):
+            return explained, None
+        aligned = self._align(pair, explained)
+        return aligned.explained, judge_cues(self._evidence, evidence_cues(aligned), aligned.explained)
 
     def _explain(self, pair: FramePair) -> Explanation:
         """Predict the static world's flow, and see what it leaves unexplained."""

@@ -11,20 +11,15 @@ off (``motion_refinement``). Of the rest, only what lies *across* the epipolar l
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from viflow_anomaly.config import EVIDENCE_BLOCK_PX
-from viflow_anomaly.correction import moved_cells
-from viflow_anomaly.explanation import Explanation
+from viflow_anomaly.alignment import HALF_TEXTURE_GRAY2, AlignedPair
+from viflow_anomaly.block_geometry import on_blocks, padded
 from viflow_anomaly.geometry import Float32Array
-from viflow_anomaly.measured_flow import measure_remaining_flow
-from viflow_anomaly.motion_refinement import Line, MovedPoints, common_motion_px
-from viflow_anomaly.prediction import PredictedFlow, view_rays
-from viflow_anomaly.view import InternalView
+from viflow_anomaly.motion_refinement import Line
 
 PHOTOMETRIC_CUES = ("difference", "normalised residual", "half range")
 GEOMETRIC_CUES = (
@@ -40,17 +35,14 @@ GEOMETRIC_CUES = (
     "predicted flow",
     "local flow across",
     "local flow along",
+    "remaining depth",
 )
-MIN_PARALLAX_PX = 0.05
-"""Added to x of every slope, so that a line of no parallax lies along x; much longer slopes keep their direction. One
-of (-0.05, 0) px has neither line nor split flow."""
+CUES_VERSION = 2
+"""Raised with every change of their arithmetic: a head must judge the cues that it has learned from."""
 HALF_GRAY, HALF_NORMALISED_GRAY, HALF_MISMATCH_GRAY = 16.0, 8.0, 8.0
+HALF_LOG_DEPTH, SURE_PARALLAX_PX = 0.5, 0.25
 HALF_REMAINING_PX, HALF_PARALLAX_PX, HALF_FLOW_PX = 1.0, 4.0, 16.0
-HALF_TEXTURE_GRAY2 = 8.0
 """Values at which a cue is half of its largest: c = v / (|v| + half)."""
-MIN_INVERSE_DEPTH = 1e-3
-SIDE_MULTIPLE_PX = 32
-"""Images are padded to multiples of it: the coarsest stride of the head."""
 
 
 class EvidenceCues(NamedTuple):
@@ -58,65 +50,37 @@ class EvidenceCues(NamedTuple):
 
     Attributes:
         photometric: [3, H', W'] float32, ``PHOTOMETRIC_CUES``.
-        geometric: [12, H' / 4, W' / 4] float32, ``GEOMETRIC_CUES``.
+        geometric: [13, H' / 4, W' / 4] float32, ``GEOMETRIC_CUES``.
     """
 
     photometric: Float32Array
     geometric: Float32Array
 
 
-def evidence_cues(explained: Explanation, *, focal_px: float) -> EvidenceCues:
-    """The cues of one pair.
-
-    Args:
-        explained: at the source image's size.
-        focal_px: that the network takes the view for.
-    """
+def evidence_cues(aligned: AlignedPair) -> EvidenceCues:
+    """The cues of one pair."""
+    explained, geometry, remaining = aligned.explained, aligned.geometry, aligned.remaining
     predicted, view = explained.predicted, explained.model_input.view
-    source, inside = _padded(explained.source), _padded(explained.inside.astype(np.uint8), outside=True)
-    rebuilt = _padded(np.clip(np.rint(explained.reconstruction), 0, 255).astype(np.uint8))
-    np.copyto(rebuilt, source, where=inside == 0)
-    height, width = source.shape
-    photometric = np.empty((len(PHOTOMETRIC_CUES), height, width), dtype=np.float32)
-    difference = np.asarray(cv2.subtract(rebuilt, source, dtype=cv2.CV_32F), dtype=np.float32)
+    photometric = np.empty((len(PHOTOMETRIC_CUES), *aligned.source.shape), dtype=np.float32)
+    difference = np.asarray(cv2.subtract(aligned.rebuilt, aligned.source, dtype=cv2.CV_32F), dtype=np.float32)
     _bound(difference, HALF_GRAY, photometric[0])
-    _bound(_padded(explained.normalised, outside=True), HALF_NORMALISED_GRAY, photometric[1])
-    _bound(_padded(explained.half_range), HALF_GRAY, photometric[2])
+    _bound(padded(explained.normalised, outside=True), HALF_NORMALISED_GRAY, photometric[1])
+    _bound(padded(explained.half_range), HALF_GRAY, photometric[2])
 
-    blocks = (width // EVIDENCE_BLOCK_PX, height // EVIDENCE_BLOCK_PX)
-    geometric = np.empty((len(GEOMETRIC_CUES), *blocks[::-1]), dtype=np.float32)
-    inside_share = np.asarray(cv2.resize(inside * np.float32(1), blocks, interpolation=cv2.INTER_AREA), np.float32)
-    remaining = measure_remaining_flow(source, rebuilt, block_px=EVIDENCE_BLOCK_PX)
-    depth = _depth_on_blocks(predicted, view, blocks, focal_px)
-    line = _epipolar_lines(depth.slope_px)
-    remaining_px, local_px = remaining.flow_px, remaining.local_flow_px
-    if depth.points is not None:
-        texture = np.maximum(remaining.texture_gray2, 0)
-        trust = np.asarray(texture / (texture + HALF_TEXTURE_GRAY2) * inside_share, dtype=np.float32)
-        focal = (view.step_px[0] * focal_px, view.step_px[1] * focal_px)
-        common = common_motion_px(remaining_px, trust, depth.points, line, focal)
-        remaining_px, local_px = remaining_px - common, local_px - common
-    _split_along(remaining_px, line, geometric[0:2])
-    _split_along(local_px, line, geometric[10:12])
-    _bound(np.linalg.norm(remaining_px, axis=-1), HALF_REMAINING_PX, geometric[2])
-    _bound(line.parallax_px, HALF_PARALLAX_PX, geometric[5])
+    geometric = np.empty((len(GEOMETRIC_CUES), *geometry.log_ratio.shape), dtype=np.float32)
+    _split_along(remaining.flow_px, geometry.line, geometric[0:2])
+    _split_along(remaining.local_flow_px, geometry.line, geometric[10:12])
+    _bound(np.linalg.norm(remaining.flow_px, axis=-1), HALF_REMAINING_PX, geometric[2])
     _bound(remaining.mismatch_gray, HALF_MISMATCH_GRAY, geometric[3])
     _bound(remaining.texture_gray2, HALF_TEXTURE_GRAY2, geometric[4])
-    np.clip(depth.log_ratio, -1, 1, out=geometric[6])
-    np.clip(depth.log_inverse_depth * np.float32(0.5), -1, 1, out=geometric[7])
-    geometric[8] = inside_share
-    flow_px = _on_blocks(predicted.flow_px, predicted, view, blocks) * np.array(view.step_px, dtype=np.float32)
+    _bound(geometry.line.parallax_px, HALF_PARALLAX_PX, geometric[5])
+    np.clip(geometry.log_ratio, -1, 1, out=geometric[6])
+    np.clip(geometry.log_inverse_depth * np.float32(0.5), -1, 1, out=geometric[7])
+    geometric[8] = aligned.inside_share
+    _bound(aligned.log_depth + _remaining_log_depth(remaining.flow_px, geometry.line), HALF_LOG_DEPTH, geometric[12])
+    flow_px = on_blocks(predicted.flow_px, predicted, view) * np.array(view.step_px, dtype=np.float32)
     _bound(np.linalg.norm(flow_px, axis=-1), HALF_FLOW_PX, geometric[9])
     return EvidenceCues(photometric, geometric)
-
-
-def _padded(image: NDArray[Any], *, outside: bool = False) -> NDArray[Any]:
-    """[H', W']; beyond the image its border is repeated, or nothing is (``outside``)."""
-    below, right = (-side % SIDE_MULTIPLE_PX for side in image.shape[:2])
-    if not below and not right:
-        return image
-    border = cv2.BORDER_CONSTANT if outside else cv2.BORDER_REPLICATE
-    return cv2.copyMakeBorder(image, 0, below, 0, right, border)
 
 
 def _bound(values: Float32Array, half: float, out: Float32Array) -> None:
@@ -126,48 +90,6 @@ def _bound(values: Float32Array, half: float, out: Float32Array) -> None:
     np.divide(values, out, out=out)
 
 
-class _DepthOnBlocks(NamedTuple):
-    """What the corrected depth and motion say of each block [h, w]; zeros where the network gives flow only.
-
-    Attributes:
-        slope_px: [h, w, 2] source pixels for a change of the inverse depth's logarithm by one.
-        log_ratio: that change as the correction made it.
-        log_inverse_depth: the logarithm itself.
-        points: after the motion; None where the network gives flow only.
-    """
-
-    slope_px: Float32Array
-    log_ratio: Float32Array
-    log_inverse_depth: Float32Array
-    points: MovedPoints | None
-
-
-def _depth_on_blocks(
-    predicted: PredictedFlow, view: InternalView, blocks: tuple[int, int], focal_px: float
-) -> _DepthOnBlocks:
-    correction, shape = predicted.correction, predicted.flow_px.shape[:2]
-    if correction is None or correction.motion is None or correction.inverse_depth is None:
-        none = np.zeros(blocks[::-1], dtype=np.float32)
-        return _DepthOnBlocks(np.zeros((*none.shape, 2), np.float32), none, none, None)
-    rays = view_rays(*shape, predicted.stride, view.height, view.width, focal_px)
-    moved = moved_cells(rays, correction.inverse_depth, correction.motion)
-    log_depth = np.log(np.maximum(correction.inverse_depth, MIN_INVERSE_DEPTH))
-    log_ratio = np.zeros_like(log_depth) if correction.log_depth_ratio is None else correction.log_depth_ratio
-    slope = moved.slope * (np.array(view.step_px, dtype=np.float32) * np.float32(focal_px))
-    first = _on_blocks(np.dstack([slope, log_ratio, log_depth]), predicted, view, blocks)
-    second = _on_blocks(np.dstack([moved.x, moved.y, moved.nearness]), predicted, view, blocks)
-    points = MovedPoints(*(np.ascontiguousarray(second[..., axis]) for axis in range(3)))
-    return _DepthOnBlocks(first[..., :2], first[..., 2], first[..., 3], points)
-
-
-def _epipolar_lines(slope_px: Float32Array) -> Line:
-    """Of slopes [h, w, 2] in source pixels; see ``MIN_PARALLAX_PX``."""
-    x, y = slope_px[..., 0] + np.float32(MIN_PARALLAX_PX), slope_px[..., 1]
-    length = np.sqrt(x * x + y * y)
-    inverse = 1 / np.maximum(length, np.float32(1e-6))
-    return Line(x * inverse, y * inverse, length)
-
-
 def _split_along(flow_px: Float32Array, line: Line, out: Float32Array) -> None:
     """[2, h, w]: how far a flow goes across and along the line, bounded."""
     u, v = flow_px[..., 0], flow_px[..., 1]
@@ -175,12 +97,7 @@ def _split_along(flow_px: Float32Array, line: Line, out: Float32Array) -> None:
     _bound(u * line.x + v * line.y, HALF_REMAINING_PX, out[1])
 
 
-def _on_blocks(
-    cells: Float32Array, predicted: PredictedFlow, view: InternalView, blocks: tuple[int, int]
-) -> Float32Array:
-    """[h, w, C] of the padded image; beyond the image its border is repeated."""
-    sampled = view.sample_blocks(cells, predicted.stride, EVIDENCE_BLOCK_PX)
-    below, right = blocks[1] - sampled.shape[0], blocks[0] - sampled.shape[1]
-    if below or right:
-        sampled = np.asarray(cv2.copyMakeBorder(sampled, 0, below, 0, right, cv2.BORDER_REPLICATE), np.float32)
-    return sampled
+def _remaining_log_depth(flow_px: Float32Array, line: Line) -> Float32Array:
+    """[h, w] by how much the inverse depth's logarithm had to grow to explain what remains along the line."""
+    along = flow_px[..., 0] * line.x + flow_px[..., 1] * line.y
+    return np.asarray(along / (line.parallax_px + np.float32(SURE_PARALLAX_PX)), dtype=np.float32)

@@ -14,7 +14,7 @@ import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -27,65 +27,84 @@ from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import DatasetError, InvalidInputError
 from viflow_anomaly.evaluation.flow_truth import RecordingTruth
 from viflow_anomaly.evaluation.labelled_pairs import labels_of
-from viflow_anomaly.evidence_cues import GEOMETRIC_CUES, PHOTOMETRIC_CUES
+from viflow_anomaly.evaluation.perturbed_pairs import Perturbation, unperturbed
+from viflow_anomaly.evidence_augmentation import NO_AUGMENT, Augment
+from viflow_anomaly.evidence_cues import CUES_VERSION, GEOMETRIC_CUES, PHOTOMETRIC_CUES
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.sensor_data import Uint8Array
 
 MOVING, IGNORED, SEAM = 1, 2, 4
 """Bits of ``truth``: a counted mover; what counts neither way; a moving pixel near another moving thing."""
 SEAM_REACH_PX = 3
+MAX_OFFSET_BLOCKS = 127
 BYTE_SCALE = np.float32(127.5)
 TRIES = 3
 """A crop without a mover is drawn anew this often: most of a picture rests."""
+Bytes = NDArray[Any]
+"""uint8, or int8 for offsets."""
 ACROSS = [k for k, name in enumerate(GEOMETRIC_CUES) if name.endswith("across")]
 
 
 class EvidenceBatch(NamedTuple):
-    """photometric [B, 3, h, w] and geometric [B, 12, h/4, w/4] float32 in -1..1, truth [B, h, w] uint8."""
+    """photometric [B, 3, h, w] and geometric [B, 13, h/4, w/4] float32 in -1..1, truth [B, h, w] uint8, offsets
+    [B, 2, h/4, w/4] int8 in blocks."""
 
     photometric: Float32Array
     geometric: Float32Array
     truth: Uint8Array
+    offsets: Bytes
+
+
+class Example(NamedTuple):
+    """One pair, or a crop of one: photometric [3, H, W], geometric [13, H/4, W/4], truth [H, W] of bits, offsets
+    [2, H/4, W/4] from each block to the middle of the thing it belongs to, in blocks (y, x)."""
+
+    photometric: Bytes
+    geometric: Bytes
+    truth: Bytes
+    offsets: Bytes
 
 
 @dataclass(frozen=True, eq=False)
 class Examples:
-    """The pairs of one recording: photometric [N, 3, H', W'], geometric [N, 12, H'/4, W'/4], truth [N, H', W']."""
+    """The pairs of one recording; arrays as in ``Example``, with N in front."""
 
-    photometric: Uint8Array
-    geometric: Uint8Array
-    truth: Uint8Array
+    photometric: Bytes
+    geometric: Bytes
+    truth: Bytes
+    offsets: Bytes
 
     def __len__(self) -> int:
         return len(self.truth)
 
 
-def extract_examples(detector: AnomalyDetector, path: Path, *, every: int = 1) -> Examples:
-    """Cues and truth of every n-th pair of a recording with masks of what moves.
+def extract_examples(
+    detector: AnomalyDetector, path: Path, *, every: int = 1, perturbation: Perturbation = unperturbed
+) -> Examples:
+    """Cues and truth of every n-th pair of a recording with masks of what moves, seen through a perturbation.
 
     Raises:
         DatasetError: ``ground_truth_missing`` where no pair is usable; as ``RecordingTruth``.
     """
     recording = RecordingTruth(path)
-    photometric, geometric, truth = [], [], []
+    examples = []
     for index in range(0, len(recording), every):
         try:
-            pair = recording.pair(index)
+            pair = perturbation(recording.pair(index))
             cues, inside = detector.cues(pair)
         except InvalidInputError:
             continue
-        photometric.append(_as_bytes(cues.photometric))
-        geometric.append(_as_bytes(cues.geometric))
-        padded = np.full(cues.photometric.shape[1:], IGNORED, dtype=np.uint8)
-        seen = truth_of(recording.ground_truth, pair.source.timestamp_ns)
-        height, width = seen.shape
-        padded[:height, :width] = np.where(inside, seen, IGNORED)
-        truth.append(padded)
-    if not truth:
+        instances = recording.ground_truth.instances(pair.source.timestamp_ns)
+        seen = np.where(inside, truth_of(recording.ground_truth, pair.source.timestamp_ns), IGNORED)
+        truth = np.full(cues.photometric.shape[1:], IGNORED, dtype=np.uint8)
+        truth[: seen.shape[0], : seen.shape[1]] = seen
+        offsets = offsets_of(instances, cues.geometric.shape[1:])
+        examples.append(Example(_as_bytes(cues.photometric), _as_bytes(cues.geometric), truth, offsets))
+    if not examples:
         raise DatasetError(
             f"{path}: expected a pair that can be judged, found none", code="ground_truth_missing", field="data"
         )
-    return Examples(np.stack(photometric), np.stack(geometric), np.stack(truth))
+    return Examples(*(np.stack([one[k] for one in examples]) for k in range(len(Example._fields))))
 
 
 def truth_of(ground_truth: GroundTruthFolder, source_timestamp_ns: int) -> Uint8Array:
@@ -103,41 +122,56 @@ def truth_of(ground_truth: GroundTruthFolder, source_timestamp_ns: int) -> Uint8
     return truth
 
 
+def offsets_of(instances: Uint8Array, blocks: tuple[int, ...]) -> Bytes:
+    """[2, h, w] blocks (y, x) from each block to the middle of the thing at its own middle; 0 where there is none.
+
+    Args:
+        instances: [H, W] numbers of things, 0 is none.
+        blocks: h and w, of the padded image.
+    """
+    offsets = np.zeros((2, *blocks), dtype=np.int8)
+    middle = EVIDENCE_BLOCK_PX // 2
+    owners = instances[middle::EVIDENCE_BLOCK_PX, middle::EVIDENCE_BLOCK_PX]
+    for thing in np.unique(owners[owners > 0]):
+        pixels, mine = np.nonzero(instances == thing), np.nonzero(owners == thing)
+        for axis in range(2):
+            centre = (pixels[axis].mean() + 0.5) / EVIDENCE_BLOCK_PX - 0.5
+            offsets[axis][mine] = np.clip(np.rint(centre - mine[axis]), -MAX_OFFSET_BLOCKS, MAX_OFFSET_BLOCKS)
+    return offsets
+
+
 def _as_bytes(cues: Float32Array) -> Uint8Array:
     return np.asarray(np.rint((cues + 1) * BYTE_SCALE), dtype=np.uint8)
 
 
-def kept_examples(detector: AnomalyDetector, path: Path, folder: Path, *, every: int = 1) -> Examples:
+def kept_examples(
+    detector: AnomalyDetector, path: Path, folder: Path, *, every: int = 1, augment: Augment = NO_AUGMENT
+) -> Examples:
     """``extract_examples``, kept in ``folder``; what an earlier run left there is read if it would be the same.
 
     Raises:
         DatasetError: as ``extract_examples``; ``evidence_data_malformed`` for a file there that is none of these.
     """
-    kept, about = folder / f"{path.name}.npz", _made_with(detector, path, every)
+    kept, about = folder / f"{path.name}.npz", _made_with(detector, path, every, augment)
     if kept.exists():
         examples = _read_kept(kept, about)
         if examples is not None:
             return examples
-    examples = extract_examples(detector, path, every=every)
+    examples = extract_examples(detector, path, every=every, perturbation=augment.of(path.name))
     buffer = io.BytesIO()
-    np.savez(
-        buffer,
-        about=np.array(about),
-        photometric=examples.photometric,
-        geometric=examples.geometric,
-        truth=examples.truth,
-    )
+    np.savez(buffer, about=np.array(about), **{name: getattr(examples, name) for name in Example._fields})
     write_atomically(kept, buffer.getvalue())
     return examples
 
 
-def _made_with(detector: AnomalyDetector, path: Path, every: int) -> str:
+def _made_with(detector: AnomalyDetector, path: Path, every: int, augment: Augment) -> str:
     """All that the cues of a recording depend on; of the recording itself the names and sizes of its files."""
     files = sorted((str(one.relative_to(path)), one.stat().st_size) for one in path.rglob("*") if one.is_file())
     config = detector.config
     about = {
         "model": detector.model_info.sha256,
-        "cues": (PHOTOMETRIC_CUES, GEOMETRIC_CUES),
+        "cues": (PHOTOMETRIC_CUES, GEOMETRIC_CUES, CUES_VERSION),
+        "augment": augment,
         "correction": config.correction.model_dump(mode="json"),
         "softening": config.regions.texture_softening_gray,
         "residual": (config.residual, config.photometric_compensation),
@@ -153,7 +187,7 @@ def _read_kept(kept: Path, about: str) -> Examples | None:
         with np.load(io.BytesIO(kept.read_bytes()), allow_pickle=False) as arrays:
             if str(arrays["about"]) != about:
                 return None
-            examples = Examples(arrays["photometric"], arrays["geometric"], arrays["truth"])
+            examples = Examples(*(arrays[name] for name in Example._fields))
         count, height, width = examples.truth.shape
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as err:
         raise _malformed(kept, str(err)) from err
@@ -161,6 +195,7 @@ def _read_kept(kept: Path, about: str) -> Examples | None:
     shapes = {
         "photometric": (count, len(PHOTOMETRIC_CUES), height, width),
         "geometric": (count, len(GEOMETRIC_CUES), *blocks),
+        "offsets": (count, 2, *blocks),
     }
     for name, shape in shapes.items():
         if getattr(examples, name).shape != shape:
@@ -197,10 +232,10 @@ class EvidenceData:
         """The batch of one step, a function of the seed and the step alone; mirrored at random."""
         rng = np.random.default_rng((self._config.seed, step))
         crops = [self._crop(rng) for _ in range(self._config.batch_size)]
-        photometric, geometric, truth = (np.stack([crop[k] for crop in crops]) for k in range(3))
-        return EvidenceBatch(_as_cues(photometric), _as_cues(geometric), truth)
+        whole = Example(*(np.stack([crop[k] for crop in crops]) for k in range(len(Example._fields))))
+        return EvidenceBatch(_as_cues(whole.photometric), _as_cues(whole.geometric), whole.truth, whole.offsets)
 
-    def _crop(self, rng: np.random.Generator) -> tuple[Uint8Array, Uint8Array, Uint8Array]:
+    def _crop(self, rng: np.random.Generator) -> Example:
         number = int(rng.integers(self._ends[-1]))
         which = int(np.searchsorted(self._ends, number, side="right"))
         examples, index = self._examples[which], number - int(self._ends[which]) + len(self._examples[which])
@@ -215,35 +250,39 @@ class EvidenceData:
             truth = examples.truth[index][pixels]
             if (truth & MOVING).any():
                 break
-        crop = (examples.photometric[index][:, *pixels], examples.geometric[index][:, *blocks], truth)
-        return _mirrored(*_filled(*crop, sides), flips=rng.random(2) < 0.5)
+        crop = Example(
+            examples.photometric[index][:, *pixels],
+            examples.geometric[index][:, *blocks],
+            truth,
+            examples.offsets[index][:, *blocks],
+        )
+        return _mirrored(_filled(crop, sides), flips=rng.random(2) < 0.5)
 
 
-def _filled(
-    photometric: Uint8Array, geometric: Uint8Array, truth: Uint8Array, sides: tuple[int, int]
-) -> tuple[Uint8Array, Uint8Array, Uint8Array]:
-    """Crops of an image smaller than they are to be: beyond it nothing differs and nothing counts."""
-    below, right = (side - have for side, have in zip(sides, geometric.shape[1:], strict=True))
+def _filled(crop: Example, sides: tuple[int, int]) -> Example:
+    """A crop of an image smaller than it is to be: beyond it nothing differs and nothing counts."""
+    below, right = (side - have for side, have in zip(sides, crop.geometric.shape[1:], strict=True))
     if not below and not right:
-        return photometric, geometric, truth
+        return crop
     pixels, blocks = ((0, below * EVIDENCE_BLOCK_PX), (0, right * EVIDENCE_BLOCK_PX)), ((0, below), (0, right))
     none = round(float(BYTE_SCALE))
-    return (
-        np.pad(photometric, ((0, 0), *pixels), constant_values=none),
-        np.pad(geometric, ((0, 0), *blocks), constant_values=none),
-        np.pad(truth, pixels, constant_values=IGNORED),
+    return Example(
+        np.pad(crop.photometric, ((0, 0), *pixels), constant_values=none),
+        np.pad(crop.geometric, ((0, 0), *blocks), constant_values=none),
+        np.pad(crop.truth, pixels, constant_values=IGNORED),
+        np.pad(crop.offsets, ((0, 0), *blocks)),
     )
 
 
-def _mirrored(
-    photometric: Uint8Array, geometric: Uint8Array, truth: Uint8Array, *, flips: NDArray[np.bool_]
-) -> tuple[Uint8Array, Uint8Array, Uint8Array]:
+def _mirrored(crop: Example, *, flips: NDArray[np.bool_]) -> Example:
     """Upside down, left to right, both or neither; what lies across the epipolar line changes sides with one flip."""
-    steps = tuple(slice(None, None, -1 if flip else 1) for flip in flips)
-    photometric, geometric, truth = photometric[:, *steps], geometric[:, *steps].copy(), truth[steps]
+    axes = tuple(int(axis) - 2 for axis in np.flatnonzero(flips))
+    mirrored = Example(*(np.flip(part, axes).copy() for part in crop))
     if flips[0] != flips[1]:
-        geometric[ACROSS] = 255 - geometric[ACROSS]
-    return photometric, geometric, truth
+        mirrored.geometric[ACROSS] = 255 - mirrored.geometric[ACROSS]
+    for axis in np.flatnonzero(flips):
+        np.negative(mirrored.offsets[axis], out=mirrored.offsets[axis])
+    return mirrored
 
 
 def _as_cues(values: Uint8Array) -> Float32Array:
@@ -256,6 +295,7 @@ def load_examples(
     folder: Path,
     *,
     every: int = 1,
+    augment: Augment = NO_AUGMENT,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> list[Examples]:
     """``kept_examples`` of all recordings, in their order.
@@ -276,7 +316,7 @@ def load_examples(
             RecordingTruth(path)  # what is wrong with the last one should be told before the first takes its time
     examples = []
     for done, path in enumerate(recordings, start=1):
-        examples.append(kept_examples(detector, path, folder, every=every))
+        examples.append(kept_examples(detector, path, folder, every=every, augment=augment))
         if on_progress is not None:
             on_progress(done, len(recordings))
     return examples

@@ -18,7 +18,8 @@ from viflow_anomaly.detection import ModelInfo
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.evaluation.labelled_pairs import SimulatedPairs
-from viflow_anomaly.evidence_cues import GEOMETRIC_CUES, PHOTOMETRIC_CUES
+from viflow_anomaly.evidence_augmentation import Augment
+from viflow_anomaly.evidence_cues import CUES_VERSION, GEOMETRIC_CUES, PHOTOMETRIC_CUES
 from viflow_anomaly.evidence_data import EvidenceData, load_examples
 from viflow_anomaly.evidence_training import EvidenceTraining, Fingerprint
 from viflow_anomaly.region_score_fit import fit_region_score, labelled_regions
@@ -81,6 +82,7 @@ def train_evidence(
             data,
             out_dir / "cues",
             every=training.every,
+            augment=Augment(training.seed, training.augmented_share),
             on_progress=lambda done, total: report("reading", done, total),
         )
         _run_steps(run, EvidenceData(examples, training), out_dir, fingerprint, report)
@@ -117,6 +119,7 @@ def _record(
         head=training.head,
         photometric_cues=PHOTOMETRIC_CUES,
         geometric_cues=GEOMETRIC_CUES,
+        cues_version=CUES_VERSION,
         provenance={
             "commit": source_commit(),
             "training": training.model_dump(mode="json"),

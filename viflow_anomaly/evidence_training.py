@@ -15,11 +15,11 @@ import torch.nn.functional as F  # noqa: N812  # torch's own convention
 from torch import nn
 
 from viflow_anomaly.checkpoint import save_training_state
-from viflow_anomaly.config import EvidenceTrainingConfig
+from viflow_anomaly.config import EVIDENCE_BLOCK_PX, EvidenceTrainingConfig
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.evidence_data import IGNORED, MOVING, SEAM, EvidenceBatch, EvidenceData
 from viflow_anomaly.model.evidence_builder import build_evidence_head
-from viflow_anomaly.model.evidence_head import EvidenceHead
+from viflow_anomaly.model.evidence_head import OFFSET_SCALE_BLOCKS, EvidenceHead
 from viflow_anomaly.training_state import learning_rate, resume_state, state_tensors
 
 Fingerprint = dict[str, object]
@@ -55,11 +55,13 @@ class EvidenceTraining:
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(self.config, self.step)
         cues = (torch.from_numpy(one).to(self.device) for one in (batch.photometric, batch.geometric))
-        logits = self.network(*(one.contiguous(memory_format=torch.channels_last) for one in cues))
+        logits, offsets = self.network(*(one.contiguous(memory_format=torch.channels_last) for one in cues))
         truth = torch.from_numpy(batch.truth).to(self.device)
         loss = evidence_loss(
             logits, truth, motion_weight=self.config.motion_weight, seam_weight=self.config.seam_weight
         )
+        true_offsets = torch.from_numpy(batch.offsets).to(self.device)
+        loss = loss + self.config.offset_weight * offset_loss(offsets, true_offsets, truth)
         value = float(loss.detach())
         if not math.isfinite(value):
             raise ConfigError(
@@ -110,3 +112,17 @@ def evidence_loss(
     dice = 1 - (2 * shared + 1) / (total + 1)
     seams = F.binary_cross_entropy_with_logits(logits[:, 1], seam, reduction="none", pos_weight=weight)
     return cross_entropy + 0.5 * dice + seam_weight * (seams * moving).sum() / moving.sum().clamp(min=1)
+
+
+def offset_loss(offsets: torch.Tensor, true_offsets: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    """Mean absolute error of where things have their middles, over blocks that move, in ``OFFSET_SCALE_BLOCKS``.
+
+    Args:
+        offsets: [B, 2, h, w] in blocks.
+        true_offsets: [B, 2, h, w] likewise.
+        truth: [B, H, W] uint8 bits.
+    """
+    middle = EVIDENCE_BLOCK_PX // 2
+    moving = ((truth[:, middle::EVIDENCE_BLOCK_PX, middle::EVIDENCE_BLOCK_PX] & MOVING) != 0).float()
+    error = F.smooth_l1_loss(offsets, true_offsets.float(), reduction="none").sum(dim=1) / OFFSET_SCALE_BLOCKS
+    return (error * moving).sum() / moving.sum().clamp(min=1)

@@ -55,8 +55,19 @@ def explain(pair: FramePair, model_input: ModelInput, predicted: PredictedFlow, 
         predicted: the flow of the static world.
         config: which residual, and whether an exposure is compensated.
     """
+    coordinates = model_input.view.target_coordinates(predicted.flow_px, predicted.stride)
+    return explain_at(pair, model_input, predicted, coordinates, config)
+
+
+def explain_at(
+    pair: FramePair,
+    model_input: ModelInput,
+    predicted: PredictedFlow,
+    coordinates: Float32Array,
+    config: DetectorConfig,
+) -> Explanation:
+    """``explain`` with the target coordinates [H, W, 2] of every source pixel known."""
     source, view = pair.source.image, model_input.view
-    coordinates = view.target_coordinates(predicted.flow_px, predicted.stride)
     reconstruction, inside = reconstruct(pair.target.image, coordinates)
     if (analyzed := view.analyzed()) is not None:
         inside &= analyzed

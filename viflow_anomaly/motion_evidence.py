@@ -10,7 +10,7 @@ import numpy as np
 from viflow_anomaly.checkpoint_record import EvidenceRecord
 from viflow_anomaly.config import DetectorConfig
 from viflow_anomaly.errors import CheckpointError
-from viflow_anomaly.evidence_cues import GEOMETRIC_CUES, PHOTOMETRIC_CUES, EvidenceCues
+from viflow_anomaly.evidence_cues import CUES_VERSION, GEOMETRIC_CUES, PHOTOMETRIC_CUES, EvidenceCues
 from viflow_anomaly.explanation import Explanation
 from viflow_anomaly.moving_regions import REGION_FEATURES, MotionMaps, find_moving_regions, sigmoid
 from viflow_anomaly.regions import Region, find_regions
@@ -30,11 +30,12 @@ def require_our_cues(record: EvidenceRecord) -> None:
     Raises:
         CheckpointError: ``evidence_cues_differ``, ``checkpoint_record_invalid``.
     """
-    expected, found = (PHOTOMETRIC_CUES, GEOMETRIC_CUES), (record.photometric_cues, record.geometric_cues)
+    expected = (PHOTOMETRIC_CUES, GEOMETRIC_CUES, CUES_VERSION)
+    found = (record.photometric_cues, record.geometric_cues, record.cues_version)
     if expected != found:
         raise CheckpointError(
-            f"evidence head {record.name} {record.version}: expected one that was trained on the cues {expected}, "
-            f"found {found}",
+            f"evidence head {record.name} {record.version}: expected one that was trained on the cues (names, "
+            f"version) {expected}, found {found}",
             code="evidence_cues_differ",
             field="evidence_head",
         )
@@ -58,8 +59,9 @@ def takes_head(head: LoadedEvidence | None, explanation: Explanation, config: De
 def judge_cues(head: LoadedEvidence, cues: EvidenceCues, explanation: Explanation) -> JudgedCues:
     """The head's probabilities of one pair, at the source image's size."""
     height, width = explanation.source.shape
-    logits = head.runtime.judge(*cues)[:, :height, :width]
-    return JudgedCues(cues, MotionMaps(sigmoid(np.ascontiguousarray(logits[0])), logits[1]))
+    answer = head.runtime.judge(*cues)
+    logits = answer.logits[:, :height, :width]
+    return JudgedCues(cues, MotionMaps(sigmoid(np.ascontiguousarray(logits[0])), logits[1], answer.offsets))
 
 
 def regions_of(

@@ -60,15 +60,17 @@ _CUES = [GEOMETRIC_CUES.index(name) for name in CUE_FEATURES]
 
 
 class MotionMaps(NamedTuple):
-    """What the head says of every source pixel: [H, W] probability of motion, and logit of a seam where it moves."""
+    """What the head says: [H, W] probability of motion and logit of a seam of every source pixel, and offsets
+    [2, h, w] of the padded image's blocks to the middle of the thing they belong to, in blocks (y, x)."""
 
     motion: Float32Array
     seam_logit: Float32Array
+    offsets: Float32Array
 
     @property
     def finite(self) -> bool:
         """False where the head's weights are damaged."""
-        return bool(np.isfinite(self.motion).all() and np.isfinite(self.seam_logit).all())
+        return all(bool(np.isfinite(one).all()) for one in self)
 
 
 class MeasuredRegion(NamedTuple):

@@ -19,6 +19,8 @@ from viflow_anomaly.sensor_data import Float64Array
 
 RIDGE = 1.0
 """Inverse variance of the prior on each standardised weight: a feature that a few regions show is worth little."""
+MIN_DEVIATION = 0.1
+"""A feature that hardly varies here may vary anywhere else; it must not decide."""
 NEWTON_ROUNDS = 25
 
 
@@ -59,7 +61,8 @@ def labelled_regions(
             if answer is None:
                 continue
             judged, inside = answer
-            measured = measure_regions(judged.maps, judged.cues, inside, detector.config.regions)
+            found = measure_regions(judged.maps, judged.cues, inside, detector.config.regions)
+            measured = [one for one in found if one.shape.passes]  # a band scores by the shape rule, not by this fit
             measured.sort(key=lambda one: -one.features[0])  # of two on one mover the likelier one finds it
             boxes = [ScoredBox(one.box, float(one.features[0]), True) for one in measured]
             for one, hit in zip(measured, DetectionScores.hits(boxes, pairs.labels(index)), strict=True):
@@ -80,7 +83,7 @@ def labelled_regions(
 
 def fit_region_score(regions: LabelledRegions) -> RegionScore:
     """Logistic regression on standardised features with a weak pull to zero, by Newton's method."""
-    mean, deviation = regions.features.mean(axis=0), regions.features.std(axis=0) + 1e-6
+    mean, deviation = regions.features.mean(axis=0), np.maximum(regions.features.std(axis=0), MIN_DEVIATION)
     design = np.column_stack([(regions.features - mean) / deviation, np.ones(len(regions.moving))])
     prior = np.full(design.shape[1], RIDGE)
     prior[-1] = 1e-6

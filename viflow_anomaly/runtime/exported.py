@@ -13,7 +13,7 @@ HEAD_KEY = "viflow.evidence_head"
 INPUT_NAMES = ("source", "motion", "interval_s", "motor")
 """The last one where the network has a motor stream."""
 FLOW_OUTPUTS = ("flow_px",)
-HEAD_INPUTS, HEAD_OUTPUTS = ("photometric", "geometric"), ("logits",)
+HEAD_INPUTS, HEAD_OUTPUTS = ("photometric", "geometric"), ("logits", "offsets")
 SCENE_OUTPUTS = ("flow_px", "inverse_depth", "rotation", "translation")
 
 

@@ -53,8 +53,20 @@ class Runtime(Protocol):
         """All hypotheses of one pair."""
 
 
+class HeadAnswer(NamedTuple):
+    """An evidence head's answer to one pair, of the padded image.
+
+    Attributes:
+        logits: [2, H', W'] float32 of motion and of seam.
+        offsets: [2, H' / 4, W' / 4] float32 from every block to the middle of its thing, in blocks (y, x).
+    """
+
+    logits: Float32Array
+    offsets: Float32Array
+
+
 class EvidenceRuntime(Protocol):
     """Runs one evidence head; threads may share it, too."""
 
-    def judge(self, photometric: Float32Array, geometric: Float32Array) -> Float32Array:
-        """Logits [2, H', W'] of motion and of seam, for cues [3, H', W'] and [12, H' / 4, W' / 4]."""
+    def judge(self, photometric: Float32Array, geometric: Float32Array) -> HeadAnswer:
+        """For cues [3, H', W'] and [13, H' / 4, W' / 4]."""

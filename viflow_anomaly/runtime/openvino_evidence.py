@@ -10,6 +10,7 @@ from viflow_anomaly.checkpoint_record import EvidenceRecord, corrupt_checkpoint
 from viflow_anomaly.config import EVIDENCE_BLOCK_PX, Precision
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.runtime.exported import HEAD_KEY
+from viflow_anomaly.runtime.interface import HeadAnswer
 from viflow_anomaly.runtime.openvino_network import OpenvinoNetwork, Size
 
 
@@ -27,11 +28,10 @@ class OpenvinoEvidence:
         if HEAD_KEY not in self._network.metadata:
             raise corrupt_checkpoint(path, "expected the export of an evidence head, found another network's")
 
-    def judge(self, photometric: Float32Array, geometric: Float32Array) -> Float32Array:
-        """Logits [2, H', W'] of motion and of seam."""
+    def judge(self, photometric: Float32Array, geometric: Float32Array) -> HeadAnswer:
         height, width = photometric.shape[1:]
         request, inputs, outputs = self._network.request((height, width))
         np.copyto(inputs["photometric"][0], photometric)
         np.copyto(inputs["geometric"][0], geometric)
         request.infer()
-        return np.asarray(outputs["logits"][0].copy(), dtype=np.float32)
+        return HeadAnswer(*(np.array(outputs[name][0], dtype=np.float32) for name in HeadAnswer._fields))

@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.runtime.interface import HeadAnswer
 
 
 class TorchEvidence:
@@ -16,10 +17,10 @@ class TorchEvidence:
         self._device = device
         self._network: nn.Module = network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def judge(self, photometric: Float32Array, geometric: Float32Array) -> Float32Array:
-        """Logits [2, H', W'] of motion and of seam."""
+    def judge(self, photometric: Float32Array, geometric: Float32Array) -> HeadAnswer:
         cuda = torch.device(self._device).type == "cuda"
         with torch.inference_mode(), torch.autocast("cuda", dtype=torch.bfloat16, enabled=cuda):
             cues = (torch.from_numpy(one)[None].to(self._device) for one in (photometric, geometric))
-            logits = self._network(*(one.contiguous(memory_format=torch.channels_last) for one in cues))
-        return np.asarray(logits[0].float().cpu().contiguous().numpy(), dtype=np.float32)
+            outputs = self._network(*(one.contiguous(memory_format=torch.channels_last) for one in cues))
+        arrays = (one[0].float().cpu().contiguous().numpy() for one in outputs)
+        return HeadAnswer(*(np.asarray(one, dtype=np.float32) for one in arrays))

@@ -31,6 +31,7 @@ class SimulatorConfig(FrozenConfig):
     thin_structures: int = Field(
         default=0, ge=0, le=300, description="railings, bare trees, poles, wires, scaffolds and bars beside the usual"
     )
+    foliage: int = Field(default=0, ge=0, le=100, description="leafy trees, bushes, patches of grass")
     imu_errors: bool = Field(default=True, description="biases, white noise, vibration; the motor's scale and noise")
     jobs: PositiveInt = Field(default=1, description="processes")
 
@@ -52,6 +53,7 @@ class SimulatorConfig(FrozenConfig):
     def sequence_record(self, sequence_seed: int) -> dict[str, Any]:
         """What the bytes of one sequence depend on, as JSON: neither the number of sequences nor of processes."""
         record = self.model_dump(mode="json", exclude={"sequences", "seed", "jobs"})
-        if not self.thin_structures:  # sequences from before there were any stay complete
-            del record["thin_structures"]
+        for name in ("thin_structures", "foliage"):  # sequences from before there were any stay complete
+            if not record[name]:
+                del record[name]
         return {**record, "sequence_seed": sequence_seed}

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from viflow_anomaly.datasets.ground_truth_folder import OBJECT_COLUMNS
 from viflow_anomaly.datasets.ground_truth_png import write_depth_png, write_flow_png, write_instances_png
 from viflow_anomaly.sensor_data import Float64Array, Uint8Array
+from viflow_anomaly.simulator import foliage
 from viflow_anomaly.simulator.config import SimulatorConfig
 from viflow_anomaly.simulator.drive import drive, park
 from viflow_anomaly.simulator.euroc_writer import write_camera, write_imu, write_motor, write_states
@@ -40,7 +41,9 @@ OBJECT_MATERIALS = 14
 # One generator for each concern, so that a draw added to one does not change the others.
 STREAMS = {
     name: index
-    for index, name in enumerate(("rig", "motion", "movers", "scene", "imu", "camera", "noise", "motor", "thin"))
+    for index, name in enumerate(
+        ("rig", "motion", "movers", "scene", "imu", "camera", "noise", "motor", "thin", "foliage")
+    )
 }
 
 
@@ -96,7 +99,9 @@ def build_world(config: SimulatorConfig, seed: int) -> World:
     times_s = (stamps - stamps[frame_indices[0]]) * 1e-9
     motion, road, arc = _move(config, seed, rig, times_s)
     camera_poses = motion.poses()[frame_indices] @ rig.T_imu_cam
-    rng_movers, rng_scene, rng_thin = (_stream(seed, name) for name in ("movers", "scene", "thin"))
+    rng_movers, rng_scene, rng_thin, rng_leaves = (
+        _stream(seed, name) for name in ("movers", "scene", "thin", "foliage")
+    )
     count = int(rng_movers.integers(config.movers[0], config.movers[1] + 1))
     materials = object_materials(rng_scene, OBJECT_MATERIALS)
     names = [material.name for material in materials]
@@ -106,6 +111,7 @@ def build_world(config: SimulatorConfig, seed: int) -> World:
         surroundings = room if rng_scene.random() < 0.7 else open_air
         scene = surroundings(rng_scene, camera_path, movers, materials)
         thin = beside_the_path(rng_thin, config.thin_structures, camera_poses, movers, names)
+        trunks, leaves = foliage.beside_the_path(rng_leaves, config.foliage, camera_poses, movers)
     else:
         layout = Layout.draw(rng_scene)
         oncoming = (layout.left_edge * 2 + layout.right_edge) / 3
@@ -116,7 +122,12 @@ def build_world(config: SimulatorConfig, seed: int) -> World:
         movers = traffic.draw(count)
         scene = street(rng_scene, road, layout, camera_path, movers, materials)
         thin = along_the_road(rng_thin, config.thin_structures, road, layout, arc_at_frames, camera_path, movers, names)
-    scene = replace(scene, solids=(*scene.solids, *thin))
+        trunks, leaves = foliage.along_the_road(
+            rng_leaves, config.foliage, road, layout, arc_at_frames, camera_path, movers
+        )
+    scene = replace(scene, solids=(*scene.solids, *thin, *trunks), strips=(*scene.strips, *leaves))
+    if leaves:
+        scene = replace(scene, materials=(*scene.materials, *foliage.leaf_materials(rng_leaves)))
     return World(rig, motion, stamps, frame_indices, camera_poses, scene)
 
 

@@ -162,6 +162,12 @@ def asphalt(rng: np.random.Generator, size: int) -> Uint8Array:
     return _finish(rng, picture, contrast=(14, 32))
 
 
+def leaves(rng: np.random.Generator, size: int) -> Uint8Array:
+    """Patches of strongly different shade with a little grain: each leaf takes a small piece."""
+    shades = cv2.resize(rng.normal(0, 1, (8, 8)), (size, size), interpolation=cv2.INTER_NEAREST)
+    return _finish(rng, np.asarray(shades + 0.35 * _noise(rng, size, coarsest=16, persistence=0.9)), contrast=(30, 70))
+
+
 _KINDS = (
     (fractal, 0.26),
     (photograph, 0.30),
