@@ -103,9 +103,21 @@ head: held-out
 	simulate car 80000 120 16 head; simulate car 80200 200 16 head; simulate car 82000 150 12 head; \
 	simulate car 81000 24 10 head --set simulator.width=832 --set simulator.height=256; \
 	simulate car 83000 60 12 head --set simulator.thin_structures=80; \
+	simulate drone 36000 120 12 head --set simulator.foliage=16; \
+	simulate drone 36200 60 8 head --set simulator.width=752 --set simulator.height=480 --set simulator.foliage=12; \
+	simulate drone 36300 140 12 head --set 'simulator.movers=[3,8]'; \
+	simulate car 86000 60 6 head --set simulator.width=1242 --set simulator.height=375 --set simulator.foliage=60; \
+	simulate car 86100 90 8 head --set simulator.width=832 --set simulator.height=256 --set simulator.foliage=50; \
+	simulate car 86300 120 12 head --set simulator.foliage=50; \
+	simulate car 86500 60 8 head --set simulator.width=1242 --set simulator.height=375; \
 	simulate drone 35000 50 7 head-calibration; simulate car 85000 50 7 head-calibration; \
 	simulate drone 35500 12 12 head-calibration --set simulator.thin_structures=24; \
-	simulate car 85500 12 12 head-calibration --set simulator.thin_structures=80
+	simulate car 85500 12 12 head-calibration --set simulator.thin_structures=80; \
+	simulate drone 35800 16 8 head-calibration --set simulator.foliage=16; \
+	simulate drone 35900 10 6 head-calibration --set simulator.width=752 --set simulator.height=480; \
+	simulate car 85800 16 8 head-calibration --set simulator.foliage=50; \
+	simulate car 85900 12 6 head-calibration --set simulator.width=832 --set simulator.height=256 \
+	  --set simulator.foliage=50
 	$(BIN)/viflow-anomaly train-evidence $(MODEL_DIR)/head/* --calibration $(MODEL_DIR)/head-calibration \
 	  --out $(MODEL_DIR)/head-run --resume --steps $(HEAD_STEPS) --threads $(HEAD_THREADS)
 	$(BIN)/viflow-anomaly export --evidence-head $(MODEL_DIR)/head-run/evidence.safetensors

@@ -17,6 +17,7 @@ from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
 from viflow_anomaly.datasets.ground_truth_png import write_instances_png
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import DatasetError
+from viflow_anomaly.evidence_augmentation import Augment
 from viflow_anomaly.evidence_cues import GEOMETRIC_CUES
 from viflow_anomaly.evidence_data import (
     ACROSS,
@@ -28,6 +29,7 @@ from viflow_anomaly.evidence_data import (
     extract_examples,
     kept_examples,
     load_examples,
+    offsets_of,
     truth_of,
 )
 
@@ -67,6 +69,45 @@ def test_where_two_movers_touch_there_is_a_seam(tmp_path: Path) -> None:
     assert (seen[10:20, 41:47] == MOVING | SEAM).all()
     assert (seen[10:20, 30:41] == MOVING).all()
     assert (seen[10:20, 47:50] == MOVING).all()
+
+
+def test_offsets_lead_to_the_middles_of_things() -> None:
+    instances = np.zeros((64, 96), np.uint8)
+    instances[8:24, 16:48], instances[40:64, 72:96] = 1, 2
+    offsets = offsets_of(instances, (16, 24))
+    rows, columns = np.mgrid[0:16, 0:24]
+    for thing, middle in ((1, (3.5, 7.5)), (2, (12.5, 20.5))):
+        mine = instances[2::4, 2::4] == thing
+        assert np.abs(rows[mine] + offsets[0][mine] - middle[0]).max() <= 0.5
+        assert np.abs(columns[mine] + offsets[1][mine] - middle[1]).max() <= 0.5
+    assert not offsets[:, instances[2::4, 2::4] == 0].any()
+
+
+def test_a_mirrored_thing_has_mirrored_offsets() -> None:
+    instances = np.zeros((32, 64), np.uint8)
+    instances[4:12, 8:40] = 1
+    blocks, nothing = (8, 16), np.full((1, 3, 32, 64), 128, np.uint8)
+    geometric = np.full((1, len(GEOMETRIC_CUES), *blocks), 128, np.uint8)
+    truth = np.where(instances, MOVING, 0).astype(np.uint8)[None]
+    data = EvidenceData([Examples(nothing, geometric, truth, offsets_of(instances, blocks)[None])], SMALL)
+    rows, columns = np.mgrid[0:8, 0:16]
+    for step in range(12):
+        batch = data.sample(step)
+        for truth_of_crop, offsets in zip(batch.truth, batch.offsets, strict=True):
+            y, x = np.nonzero(truth_of_crop)
+            moving = truth_of_crop[2::4, 2::4] != 0
+            votes = np.stack([rows + offsets[0], columns + offsets[1]])[:, moving]
+            middle = np.array([(y.mean() + 0.5) / 4 - 0.5, (x.mean() + 0.5) / 4 - 0.5])
+            assert np.abs(votes - middle[:, None]).max() <= 0.5
+
+
+def test_examples_are_seen_through_the_recordings_own_camera(tmp_path: Path, detector: AnomalyDetector) -> None:
+    path = recording(tmp_path / "drone_1")
+    plain, worse = (kept_examples(detector, path, tmp_path / "cues", augment=Augment(3, share)) for share in (0.0, 1.0))
+    assert not np.array_equal(plain.photometric, worse.photometric)
+    again = kept_examples(detector, path, tmp_path / "cues", augment=Augment(3, 1.0))
+    np.testing.assert_array_equal(worse.photometric, again.photometric)
+    np.testing.assert_array_equal(plain.offsets, worse.offsets)
 
 
 def test_examples_are_bytes_of_the_detectors_cues(tmp_path: Path, detector: AnomalyDetector) -> None:
@@ -127,6 +168,7 @@ def test_arrays_of_another_shape_are_named(tmp_path: Path, detector: AnomalyDete
         photometric=examples.photometric[:, :2],
         geometric=examples.geometric,
         truth=examples.truth,
+        offsets=examples.offsets,
     )
     with pytest.raises(DatasetError, match="photometric of shape"):
         kept_examples(detector, path, kept)
@@ -147,7 +189,8 @@ def drawn(height: int, width: int, *, seed: int = 0) -> Examples:
     truth = np.zeros((2, height, width), np.uint8)
     truth[:, 4:12, 8:20] = MOVING
     geometric = rng.integers(0, 256, (2, len(GEOMETRIC_CUES), height // 4, width // 4), dtype=np.uint8)
-    return Examples(rng.integers(0, 256, (2, 3, height, width), dtype=np.uint8), geometric, truth)
+    offsets = rng.integers(-5, 6, (2, 2, height // 4, width // 4), dtype=np.int8)
+    return Examples(rng.integers(0, 256, (2, 3, height, width), dtype=np.uint8), geometric, truth, offsets)
 
 
 def test_a_batch_is_a_function_of_seed_and_step() -> None:
@@ -160,6 +203,7 @@ def test_a_batch_is_a_function_of_seed_and_step() -> None:
     assert first.photometric.shape == (2, 3, 32, 64)
     assert first.geometric.shape == (2, len(GEOMETRIC_CUES), 8, 16)
     assert first.truth.shape == (2, 32, 64)
+    assert first.offsets.shape == (2, 2, 8, 16)
     assert np.abs(first.photometric).max() <= 1.0
 
 

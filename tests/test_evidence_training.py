@@ -18,9 +18,9 @@ from viflow_anomaly.config import EvidenceTrainingConfig
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import CheckpointError, ConfigError, DatasetError
 from viflow_anomaly.evidence_cues import GEOMETRIC_CUES
-from viflow_anomaly.evidence_data import IGNORED, MOVING, SEAM, EvidenceBatch
+from viflow_anomaly.evidence_data import IGNORED, MOVING, SEAM, EvidenceBatch, offsets_of
 from viflow_anomaly.evidence_run import train_evidence
-from viflow_anomaly.evidence_training import EvidenceTraining, evidence_loss
+from viflow_anomaly.evidence_training import EvidenceTraining, evidence_loss, offset_loss
 from viflow_anomaly.moving_regions import REGION_FEATURES, probability_of
 from viflow_anomaly.region_score_fit import LabelledRegions, fit_region_score
 
@@ -39,20 +39,23 @@ def batch(seed: int) -> EvidenceBatch:
         y, x = rng.integers(0, 16), rng.integers(0, 48)
         truth[one, y : y + 12, x : x + 12] = MOVING
         photometric[one, 0, y : y + 12, x : x + 12] = 0.8
-    return EvidenceBatch(photometric, np.zeros((4, len(GEOMETRIC_CUES), 8, 16), np.float32), truth)
+    offsets = np.stack([offsets_of(one, (8, 16)) for one in truth])
+    return EvidenceBatch(photometric, np.zeros((4, len(GEOMETRIC_CUES), 8, 16), np.float32), truth, offsets)
 
 
 def test_it_learns_what_the_cues_show() -> None:
-    run = EvidenceTraining(SMALL.model_copy(update={"steps": 150}))
-    losses = [run.train_step(batch(step)) for step in range(150)]
+    run = EvidenceTraining(SMALL.model_copy(update={"steps": 300}))
+    losses = [run.train_step(batch(step)) for step in range(300)]
     assert np.mean(losses[-10:]) < 0.4 * np.mean(losses[:5])
     new = batch(10_000)
     run.network.eval()
     with torch.inference_mode():
-        logits = run.network(torch.from_numpy(new.photometric), torch.from_numpy(new.geometric))[:, 0].numpy()
-    moving = new.truth == MOVING
-    assert (logits[moving] > 0).mean() > 0.75
+        seen, offsets = run.network(torch.from_numpy(new.photometric), torch.from_numpy(new.geometric))
+    logits, moving = seen[:, 0].numpy(), new.truth == MOVING
+    assert (logits[moving] > 0).mean() > 0.7
     assert (logits[~moving] < 0).mean() > 0.95
+    error = np.abs(offsets.numpy() - new.offsets).sum(axis=1)[moving[:, 2::4, 2::4]]
+    assert error.mean() < 0.8 * np.abs(new.offsets).sum(axis=1)[moving[:, 2::4, 2::4]].mean()
 
 
 def test_what_is_ignored_costs_nothing() -> None:
@@ -77,6 +80,17 @@ def test_seams_count_where_something_moves() -> None:
     assert float(evidence_loss(logits, truth, motion_weight=1.0, seam_weight=1.0)) == pytest.approx(float(right))
     logits[0, 1, 3] = -9.0
     assert float(evidence_loss(logits, truth, motion_weight=1.0, seam_weight=1.0)) > float(right) + 1
+
+
+def test_offsets_count_where_something_moves() -> None:
+    truth, zeros = torch.zeros(1, 8, 8, dtype=torch.uint8), torch.zeros(1, 2, 2, 2)
+    truth[0, :4] = MOVING
+    wrong = zeros.clone()
+    wrong[0, :, 1] = 5.0
+    assert float(offset_loss(wrong, zeros, truth)) == 0.0
+    wrong[0, 0, 0] = 8.5
+    assert float(offset_loss(wrong, zeros, truth)) == pytest.approx(1.0)
+    assert float(offset_loss(wrong, zeros, torch.zeros_like(truth))) == 0.0
 
 
 def test_a_frame_without_movers_has_a_loss() -> None:

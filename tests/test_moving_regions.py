@@ -37,7 +37,7 @@ def maps(*boxes: tuple[slice, slice], probability: float = 0.9, seam: tuple[slic
         motion[box] = probability
     if seam is not None:
         seams[seam] = 2.0
-    return MotionMaps(motion, seams)
+    return MotionMaps(motion, seams, np.zeros((2, SHAPE[0] // 4, SHAPE[1] // 4), np.float32))
 
 
 def regions_of(

@@ -362,7 +362,7 @@ class EvidenceTrainingConfig(FrozenConfig):
     gradient_clip: PositiveFloat = 1.0
     motion_weight: float = Field(default=3.0, gt=0, le=1e6, description="of a moving pixel beside a resting one")
     seam_weight: float = Field(default=0.3, ge=0, le=1e6, description="of the loss of seams between two movers")
-    offset_weight: float = Field(default=0.3, ge=0, le=1e6, description="of the loss of where a thing has its middle")
+    offset_weight: float = Field(default=0.15, ge=0, le=1e6, description="of the loss of where a thing has its middle")
     augmented_share: float = Field(default=0.6, ge=0, le=1, description="recordings seen through a worse camera")
     crop_width: int = Field(default=224, ge=32, le=8192, multiple_of=32)
     crop_height: int = Field(default=128, ge=32, le=8192, multiple_of=32)

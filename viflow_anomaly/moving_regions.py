@@ -16,6 +16,7 @@ from skimage.measure import label as label_components
 from viflow_anomaly.config import EVIDENCE_BLOCK_PX, RegionConfig, RegionScore
 from viflow_anomaly.evidence_cues import GEOMETRIC_CUES, HALF_PARALLAX_PX, HALF_REMAINING_PX, EvidenceCues
 from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.grouping import things_of_pixels
 from viflow_anomaly.regions import (
     BoolArray,
     BoundingBox,
@@ -94,7 +95,7 @@ def measure_regions(
         return []
     part = (slice(top, top + height), slice(left, left + width))
     y, x = pixels_of(mask[part])
-    labels = _labels(mask[part], maps.seam_logit[part])[y, x]
+    labels = things_of_pixels(_labels(mask[part], maps.seam_logit[part]), maps.offsets, (top, left))[y, x]
     components = largest_components(y + top, x + left, labels, mask.size, config)
     limits = shape_limits(config, float(np.hypot(*mask.shape)))
     measured = []

@@ -24,10 +24,11 @@ def test_it_takes_the_cues_that_there_are() -> None:
 
 
 @pytest.mark.parametrize(("height", "width"), [(32, 32), (64, 96), (128, 416)])
-def test_every_pixel_gets_two_logits(height: int, width: int) -> None:
-    logits = build_evidence_head(EvidenceHeadConfig())(*cues(height, width, count=2))
+def test_every_pixel_gets_two_logits_and_every_block_an_offset(height: int, width: int) -> None:
+    logits, offsets = build_evidence_head(EvidenceHeadConfig())(*cues(height, width, count=2))
     assert logits.shape == (2, 2, height, width)
-    assert bool(torch.isfinite(logits).all())
+    assert offsets.shape == (2, 2, height // 4, width // 4)
+    assert bool(torch.isfinite(logits).all() and torch.isfinite(offsets).all())
 
 
 def test_the_seed_fixes_the_weights_and_nothing_else() -> None:
@@ -44,7 +45,7 @@ def test_a_pixel_has_a_say_in_its_own_logit() -> None:
     head = build_evidence_head(EvidenceHeadConfig())
     photometric, geometric = cues(32, 32)
     photometric.requires_grad_()
-    head(photometric, geometric)[0, 0, 13, 22].backward()
+    head(photometric, geometric)[0][0, 0, 13, 22].backward()
     assert photometric.grad is not None
     assert float(photometric.grad[0, :, 13, 22].abs().max()) > 0
 

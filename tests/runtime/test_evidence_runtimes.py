@@ -15,7 +15,7 @@ from viflow_anomaly.cli.pair_files import PairFiles, load_pair
 from viflow_anomaly.config import DetectorConfig, EvidenceHeadConfig, ImageLimits, Precision, RuntimeName
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import CheckpointError, ConfigError
-from viflow_anomaly.evidence_cues import GEOMETRIC_CUES, PHOTOMETRIC_CUES
+from viflow_anomaly.evidence_cues import CUES_VERSION, GEOMETRIC_CUES, PHOTOMETRIC_CUES
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.model.evidence_builder import build_evidence_head
 from viflow_anomaly.runtime.export import export_evidence_onnx, export_onnx
@@ -40,6 +40,7 @@ def record(**changes: object) -> EvidenceRecord:
         "head": EvidenceHeadConfig(widths=(16, 16, 24, 24)),
         "photometric_cues": PHOTOMETRIC_CUES,
         "geometric_cues": GEOMETRIC_CUES,
+        "cues_version": CUES_VERSION,
     }
     return EvidenceRecord.model_validate(values | changes)
 
@@ -75,13 +76,15 @@ def test_openvino_answers_as_torch_does(head: Path, height: int, width: int) -> 
         load_evidence(head, runtime=runtime, threads=1, precision="f32").runtime.judge(*cues(height, width))
         for runtime in RUNTIMES
     )
-    assert torch_says.shape == openvino_says.shape == (2, height, width)
-    np.testing.assert_allclose(torch_says, openvino_says, atol=MAX_LOGIT_DIFFERENCE)
+    assert torch_says.logits.shape == openvino_says.logits.shape == (2, height, width)
+    assert torch_says.offsets.shape == openvino_says.offsets.shape == (2, height // 4, width // 4)
+    for one, other in zip(torch_says, openvino_says, strict=True):
+        np.testing.assert_allclose(one, other, atol=MAX_LOGIT_DIFFERENCE)
 
 
 def test_bfloat16_says_nearly_the_same(head: Path) -> None:
     exact, fast = (
-        load_evidence(head, runtime="openvino", precision=precision).runtime.judge(*cues(128, 160))
+        load_evidence(head, runtime="openvino", precision=precision).runtime.judge(*cues(128, 160)).logits
         for precision in PRECISIONS
     )
     assert np.abs(1 / (1 + np.exp(-exact)) - 1 / (1 + np.exp(-fast))).mean() < MAX_BFLOAT16_DIFFERENCE
@@ -113,7 +116,7 @@ def test_an_altered_export_is_stale(head: Path, tmp_path: Path) -> None:
 
 def test_a_damaged_head_abstains(tmp_path: Path) -> None:
     about = record()
-    for name in ("logits.weight", "logits.bias"):
+    for name in ("logits.weight", "logits.bias", "offsets.bias"):
         network = build_evidence_head(about.head)
         network.state_dict()[name].reshape(-1)[-1] = float("nan")  # one of the seam's
         path = save_evidence_head(tmp_path / "head.safetensors", network, about)
@@ -142,10 +145,12 @@ def test_another_networks_export_is_no_head(tmp_path: Path) -> None:
 
 
 def test_a_head_of_other_cues_is_refused(tmp_path: Path) -> None:
-    path = save(tmp_path / "head.safetensors", geometric_cues=("something else", *GEOMETRIC_CUES[1:]))
-    with pytest.raises(CheckpointError, match="something else") as caught:
-        AnomalyDetector.from_checkpoint(evidence_head=path)
-    assert caught.value.code == "evidence_cues_differ"
+    others = {"geometric_cues": ("something else", *GEOMETRIC_CUES[1:])}, {"cues_version": CUES_VERSION - 1}
+    for changes, told in zip(others, ("something else", "names, version"), strict=True):
+        path = save(tmp_path / "head.safetensors", **changes)
+        with pytest.raises(CheckpointError, match=told) as caught:
+            AnomalyDetector.from_checkpoint(evidence_head=path)
+        assert caught.value.code == "evidence_cues_differ"
 
 
 def test_a_network_is_no_head_and_a_missing_one_is_told(tmp_path: Path) -> None:

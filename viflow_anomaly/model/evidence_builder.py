@@ -7,7 +7,7 @@ import torch
 from viflow_anomaly.config import EvidenceHeadConfig
 from viflow_anomaly.model.evidence_head import EvidenceHead
 
-PHOTOMETRIC, GEOMETRIC = 3, 12
+PHOTOMETRIC, GEOMETRIC = 3, 13
 """How many cues of each kind, as ``evidence_cues`` makes them (a test compares them)."""
 
 
