@@ -111,7 +111,7 @@ def _halved(image: Uint8Array) -> Uint8Array:
 def _mismatch_gray(
     small_source: Uint8Array, small_target: Uint8Array, at_px: Float32Array, cells: tuple[int, int]
 ) -> Float32Array:
-    """[h, w] gray levels by which halved images differ, where each pixel of the source is at ``at_px`` in the target."""
+    """[h, w] gray levels by which halved images differ; each pixel of the source is at ``at_px`` in the target."""
     matched = sample_bilinear(small_target, at_px, border=cv2.BORDER_CONSTANT)
     difference = cv2.absdiff(matched, small_source)
     return np.asarray(cv2.resize(difference, cells, interpolation=cv2.INTER_AREA), dtype=np.float32)
@@ -192,7 +192,7 @@ def _local_flow(
     scale = -1 / (xx * yy - xy * xy)
     limit = np.float32(MAX_LOCAL_STEP_PX / 2)
     steps = (np.clip(scale * along, -limit, limit) for along in (yy * x - xy * y, xx * y - xy * x))
-    flow = cv2.merge(list(steps))
+    flow = np.asarray(cv2.merge(list(steps)), dtype=np.float32)
     flow += start_px
     flow_px = np.asarray(cv2.resize(flow, blocks, interpolation=cv2.INTER_AREA), dtype=np.float32)
     flow_px *= np.float32(2)

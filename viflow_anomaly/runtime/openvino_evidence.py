@@ -10,6 +10,15 @@ from viflow_anomaly.checkpoint_record import EvidenceRecord, corrupt_checkpoint
 from viflow_anomaly.config import EVIDENCE_BLOCK_PX, Precision
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.runtime.exported import HEAD_KEY
+from viflow_anomaly.runtime.openvino_blocks import (
+    CUES,
+    LOGITS,
+    PIXELS,
+    QUAD_VALUES,
+    by_blocks,
+    read_logit_blocks,
+    write_cue_blocks,
+)
 from viflow_anomaly.runtime.openvino_network import OpenvinoNetwork, Size
 
 
@@ -21,9 +30,12 @@ class OpenvinoEvidence:
 
         def shapes(size: Size) -> dict[str, list[int]]:
             blocks = [side // EVIDENCE_BLOCK_PX for side in size]
-            return {"photometric": [1, counts[0], *size], "geometric": [1, counts[1], *blocks]}
+            cues = {"photometric": [1, counts[0], *size], "geometric": [1, counts[1], *blocks]}
+            return {**cues, CUES: [1, *blocks, -(-(counts[0] * PIXELS + counts[1]) // QUAD_VALUES) * QUAD_VALUES]}
 
-        self._network = OpenvinoNetwork(path, record, shapes=shapes, threads=threads, precision=precision)
+        self._network = OpenvinoNetwork(
+            path, record, shapes=shapes, adapt=by_blocks, threads=threads, precision=precision
+        )
         if HEAD_KEY not in self._network.metadata:
             raise corrupt_checkpoint(path, "expected the export of an evidence head, found another network's")
 
@@ -31,7 +43,12 @@ class OpenvinoEvidence:
         """Logits [2, H', W'] of motion and of seam."""
         height, width = photometric.shape[1:]
         request, inputs, outputs = self._network.request((height, width))
-        np.copyto(inputs["photometric"][0], photometric)
-        np.copyto(inputs["geometric"][0], geometric)
+        if CUES in inputs:
+            write_cue_blocks(photometric, geometric, inputs[CUES][0])
+        else:
+            np.copyto(inputs["photometric"][0], photometric)
+            np.copyto(inputs["geometric"][0], geometric)
         request.infer()
+        if LOGITS in outputs:
+            return read_logit_blocks(outputs[LOGITS][0])
         return np.asarray(outputs["logits"][0].copy(), dtype=np.float32)
