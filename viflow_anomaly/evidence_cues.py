@@ -49,6 +49,8 @@ HALF_REMAINING_PX, HALF_PARALLAX_PX, HALF_FLOW_PX = 1.0, 4.0, 16.0
 HALF_TEXTURE_GRAY2 = 8.0
 """Values at which a cue is half of its largest: c = v / (|v| + half)."""
 MIN_INVERSE_DEPTH = 1e-3
+NO_GRAY = np.zeros(4)
+"""Added, so that OpenCV rounds and clips to whole gray levels."""
 SIDE_MULTIPLE_PX = 32
 """Images are padded to multiples of it: the coarsest stride of the head."""
 
@@ -74,7 +76,7 @@ def evidence_cues(explained: Explanation, *, focal_px: float) -> EvidenceCues:
     """
     predicted, view = explained.predicted, explained.model_input.view
     source, inside = _padded(explained.source), _padded(explained.inside.view(np.uint8), outside=True)
-    rebuilt = _padded(np.asarray(cv2.add(explained.reconstruction, 0.0, dtype=cv2.CV_8U), dtype=np.uint8))
+    rebuilt = _padded(np.asarray(cv2.add(explained.reconstruction, NO_GRAY, dtype=cv2.CV_8U), dtype=np.uint8))
     np.copyto(rebuilt, source, where=inside == 0)
     height, width = source.shape
     photometric = np.empty((len(PHOTOMETRIC_CUES), height, width), dtype=np.float32)
@@ -169,10 +171,15 @@ def _depth_on_blocks(
     log_depth = np.log(np.maximum(correction.inverse_depth, MIN_INVERSE_DEPTH))
     log_ratio = np.zeros_like(log_depth) if correction.log_depth_ratio is None else correction.log_depth_ratio
     slope = moved.slope * (np.array(view.step_px, dtype=np.float32) * np.float32(focal_px))
-    first = _on_blocks(cv2.merge([*cv2.split(slope), log_ratio, log_depth]), predicted, view, blocks)
-    second = _on_blocks(cv2.merge([moved.x, moved.y, moved.nearness]), predicted, view, blocks)
+    first = _on_blocks(_merged(*cv2.split(slope), log_ratio, log_depth), predicted, view, blocks)
+    second = _on_blocks(_merged(moved.x, moved.y, moved.nearness), predicted, view, blocks)
     points = MovedPoints(*(np.ascontiguousarray(second[..., axis]) for axis in range(3)))
     return _DepthOnBlocks(first[..., :2], first[..., 2], first[..., 3], points)
+
+
+def _merged(*planes: NDArray[Any]) -> Float32Array:
+    """[h, w, C] of [h, w] each."""
+    return np.asarray(cv2.merge(planes), dtype=np.float32)
 
 
 def _epipolar_lines(slope_px: Float32Array) -> Line:

@@ -38,13 +38,12 @@ def _take_cue_blocks(model: Any) -> None:
     pixels, blocks = (model.input(name).get_node() for name in ("photometric", "geometric"))
     cues = _only_consumer(blocks)
     mix = None if cues is None or cues.get_type_name() != "Concat" else _only_consumer(cues)
-    if (
-        mix is None
-        or mix.get_type_name() != "Convolution"
-        or mix.input_value(1).get_node().get_type_name() != "Constant"
-    ):
+    if mix is None or mix.get_type_name() != "Convolution":
         return
-    weights = mix.input_value(1).get_node().get_data()
+    constant = mix.input_value(1).get_node()
+    if constant.get_type_name() != "Constant":
+        return
+    weights = constant.get_data()
     missing = -weights.shape[1] % QUAD_VALUES
     padded = np.pad(weights, ((0, 0), (0, missing), (0, 0), (0, 0)))
     parameter = operations.parameter([1, -1, -1, padded.shape[1]], np.float32, name=CUES)

@@ -61,8 +61,8 @@ class OpenvinoNetwork:
     Args:
         path: of the exported network.
         record: of the checkpoint that it must have been exported from.
-        shapes: of the inputs that depend on the size (height, width) of what is seen; those that the network has not are
-            passed over.
+        shapes: of the inputs that depend on the size (height, width) of what is seen; those that the network has
+            not are passed over.
         adapt: changes the network that was read before it is compiled.
         threads: of one prediction.
         precision: "auto" computes in bfloat16 where the CPU has it.
