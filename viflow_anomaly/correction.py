@@ -96,8 +96,12 @@ def _moved(
     px, py, pz = (
         row[0] * x + row[1] * y + row[2] + inverse_depth * t for row, t in zip(rotation, translation, strict=True)
     )
-    nearness = 1 / np.maximum(pz, np.float32(MIN_DEPTH_RATIO))
-    return px * nearness, py * nearness, inverse_depth * nearness
+    np.maximum(pz, np.float32(MIN_DEPTH_RATIO), out=pz)
+    nearness = np.divide(1, pz, out=pz)
+    px *= nearness
+    py *= nearness
+    nearness *= inverse_depth
+    return px, py, nearness
 
 
 class _NormalEquations(NamedTuple):

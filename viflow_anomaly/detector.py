@@ -61,12 +61,12 @@ class Analysis(NamedTuple):
         detection: what ``detect`` returns.
         residual: [H, W] float32 photometric residual in gray levels at the source image's size.
         evidence: [H, W] float32 what regions are found in: probabilities of motion 0..1 (learned evidence), or the
-            residual, normalised by texture.
+            residual, normalised by texture. The head does not look at a pair that is not judged: probabilities are 0.
         inside: [H, W] analysed pixels that are still in the target image; elsewhere nothing is found.
         reconstruction: [H, W] float32 source image rebuilt from the target.
         target_coordinates: [H, W, 2] float32 where each source pixel is predicted in the target image.
         predicted: the flow they come from, in the network's view, and its correction.
-        learned: the evidence head judged this pair, so that ``evidence`` are probabilities.
+        learned: this is a pair for the evidence head, so that ``evidence`` are probabilities.
     """
 
     detection: Detection
@@ -196,21 +196,21 @@ class AnomalyDetector:
         """``detect`` with its maps; same errors. The paper's algorithm on one screen."""
         started = time.perf_counter()
         explained = self._explain(pair)
-        judged = self._judged_cues(explained)
         model_input, predicted = explained.model_input, explained.predicted
         residual, inside = explained.residual, explained.inside
-        inferred = time.perf_counter()
         x, y, region_width, region_height = model_input.view.region()
         summary = _summary(residual, inside, self.config.min_overlap, region_width * region_height)
         findings = _judge_input(pair, model_input.window, self.config)
         if summary is None:
             finite = bool(np.isfinite(predicted.flow_px).all())
             findings = (*findings, Finding(NOTHING_IN_COMMON if finite else NOT_FINITE, abstain=True))
-        elif judged is not None and not judged.maps.finite:
-            findings = (*findings, Finding(HEAD_NOT_FINITE, abstain=True))
         elif not any(finding.abstain for finding in findings):
             findings = (*findings, *_doubts(predicted, model_input.window, self.config))
         abstained = any(finding.abstain for finding in findings)
+        judged = None if abstained else self._judged_cues(explained)
+        if judged is not None and not judged.maps.finite:
+            findings, abstained = (*findings, Finding(HEAD_NOT_FINITE, abstain=True)), True
+        inferred = time.perf_counter()
         rois: tuple[Roi, ...] = ()
         if not abstained:
             image = ImageSize(width=residual.shape[1], height=residual.shape[0])
@@ -238,9 +238,11 @@ class AnomalyDetector:
             residual=summary,
             timings_ms=timings_ms,
         )
-        evidence = explained.normalised if judged is None else judged.maps.motion
+        learned = takes_head(self._evidence, explained, self.config)
+        nothing = np.zeros_like(residual) if learned else explained.normalised
+        evidence = nothing if judged is None else judged.maps.motion
         maps = (residual, evidence, inside, explained.reconstruction, explained.target_coordinates)
-        return Analysis(detection, *maps, predicted, learned=judged is not None)
+        return Analysis(detection, *maps, predicted, learned=learned)
 
     def judge_cues(self, pair: FramePair) -> tuple[JudgedCues, NDArray[np.bool_]] | None:
         """What the head says of a pair, and which pixels [H, W] are inside; None where regions come from the residual.

@@ -91,7 +91,7 @@ def _confidence(source: Uint8Array, target: Uint8Array, flow_px: Float32Array, c
     """[h, w] in 0..1: texture to measure by, and photometric agreement after the flow, on the halved views."""
     small_source, small_target = (_halved(image) for image in (source, target))
     height, width = small_source.shape
-    at_px = cv2.resize(flow_px, (width, height), interpolation=cv2.INTER_NEAREST)
+    at_px = np.asarray(cv2.resize(flow_px, (width, height), interpolation=cv2.INTER_NEAREST), dtype=np.float32)
     at_px *= np.float32(0.5)
     at_px += cached_pixel_grid(height, width)
     mismatch = _mismatch_gray(small_source, small_target, at_px, cells)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from skimage.measure import label as label_components
+from numpy.typing import NDArray
 
 from viflow_anomaly.config import EVIDENCE_BLOCK_PX, RegionConfig, RegionScore
 from viflow_anomaly.evidence_cues import GEOMETRIC_CUES, HALF_PARALLAX_PX, HALF_REMAINING_PX, EvidenceCues
@@ -20,7 +20,6 @@ from viflow_anomaly.regions import (
     BoolArray,
     BoundingBox,
     Component,
-    IndexArray,
     Region,
     largest_components,
     pixels_of,
@@ -92,7 +91,7 @@ def measure_regions(
         return []
     part = (slice(top, top + height), slice(left, left + width))
     y, x = pixels_of(mask[part])
-    labels = _labels(mask[part], maps.seam_logit[part])[y, x]
+    labels = _labels(mask[part], maps.seam_logit[part])[mask[part]]
     components = largest_components(y + top, x + left, labels, mask.size, config)
     limits = shape_limits(config, float(np.hypot(*mask.shape)))
     measured = []
@@ -100,7 +99,7 @@ def measure_regions(
         box, outline = component.outline()
         thickness = thickness_px(outline)
         shape = judge_shape(config.shape_rule, outline, thickness, limits)
-        features = _features(component, maps, cues, outline, shape)
+        features = _features(component, box, maps, cues, outline, shape)
         measured.append(MeasuredRegion(component, box, outline, thickness, shape, features))
     return measured
 
@@ -132,31 +131,37 @@ def find_moving_regions(
 
 
 def _judge(measured: MeasuredRegion, residual: Float32Array, score: RegionScore, config: RegionConfig) -> Region:
-    component, box, outline, thickness, shape, features = measured
+    _, box, outline, thickness, shape, features = measured
     probability = probability_of(features, score)
     if not shape.passes:
         probability = min(probability, BAND_SCORE)
     moves = shape.passes and probability >= config.motion_score
-    values = residual[component.y, component.x]
+    values = residual[box.pixels][outline]
     evidence = _evidence(features, shape, box.width / box.height, config)
     return region_of(values, box, outline, moves=moves, score=probability, thickness_px=thickness, evidence=evidence)
 
 
-def _labels(mask: BoolArray, seam_logit: Float32Array) -> IndexArray:
+def _labels(mask: BoolArray, seam_logit: Float32Array) -> NDArray[np.int32]:
     """[H, W] components (1..) of the mask, cut along seams; what is left of a seam joins no component."""
     cut = mask & (seam_logit > SEAM_LOGIT)
-    labels = np.asarray(label_components(mask & ~cut, connectivity=2))  # type: ignore[no-untyped-call]
-    if not cut.any() or labels.max() > np.iinfo(np.uint16).max:
-        return labels.astype(np.intp)
-    grown = labels.astype(np.uint16)
-    block = np.ones((3, 3), np.uint8)
+    uncut = (mask & ~cut).view(np.uint8)
+    # As scikit-image's label, in a quarter of the time: this algorithm numbers components by their first pixel, too.
+    count, found = cv2.connectedComponentsWithAlgorithm(uncut, 8, cv2.CV_32S, cv2.CCL_SAUF)
+    labels = np.asarray(found, dtype=np.int32)
+    left, top, width, height = cv2.boundingRect(cut.view(np.uint8))
+    if not width or count - 1 > np.iinfo(np.uint16).max:
+        return labels
+    # Only seams change, and one pixel around them is all that they change by.
+    near = (slice(max(top - 1, 0), top + height + 1), slice(max(left - 1, 0), left + width + 1))
+    seams, grown, block = cut[near], labels[near].astype(np.uint16), np.ones((3, 3), np.uint8)
     for _ in range(SEAM_REACH_PX):
-        np.copyto(grown, np.asarray(cv2.dilate(grown, block), np.uint16), where=cut & (grown == 0))
-    return grown.astype(np.intp)
+        np.copyto(grown, np.asarray(cv2.dilate(grown, block), np.uint16), where=seams & (grown == 0))
+    labels[near] = grown
+    return labels
 
 
 def _features(
-    component: Component, maps: MotionMaps, cues: EvidenceCues, outline: BoolArray, shape: Shape
+    component: Component, box: BoundingBox, maps: MotionMaps, cues: EvidenceCues, outline: BoolArray, shape: Shape
 ) -> Float64Array:
     """[13], in the order of ``REGION_FEATURES``."""
     y, x = component
@@ -164,7 +169,10 @@ def _features(
     at, blocks = (y[some], x[some]), (y[some] // EVIDENCE_BLOCK_PX, x[some] // EVIDENCE_BLOCK_PX)
     means = np.abs(cues.geometric[_CUES, blocks[0][:, None], blocks[1][:, None]]).mean(axis=0)
     shares = (np.log(y.size / maps.motion.size), y.size / outline.size, min(shape.nearness_to_band, 2.0))
-    mean, largest = float(maps.motion[at].mean()), float(maps.motion[y, x].max())
+    mean, (_, largest, _, _) = (
+        float(maps.motion[at].mean()),
+        cv2.minMaxLoc(maps.motion[box.pixels], outline.view(np.uint8)),
+    )
     own = (_logit(mean), _logit(largest), *shares, sigmoid(maps.seam_logit[at]).mean())
     return np.array([*own, *means], dtype=np.float64)
 
