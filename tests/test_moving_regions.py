@@ -60,10 +60,22 @@ def test_a_box_is_found_where_it_is() -> None:
 
 
 def test_nothing_is_found_outside_or_below_the_threshold() -> None:
-    assert regions_of(maps(BOX, probability=0.49)) == []
+    assert regions_of(maps(BOX, probability=0.14)) == []
     inside = np.zeros(SHAPE, np.bool_)
     drawn = maps(BOX)
     assert find_moving_regions(drawn, cues(), inside, CONFIG, residual=drawn.motion, score=RegionScore()) == []
+
+
+def test_a_faint_thing_is_found_beside_a_certain_one_and_not_around_it() -> None:
+    drawn = maps(BOX, (slice(60, 80), slice(80, 110)))
+    drawn.motion[60:80, 80:110] = 0.3
+    drawn.motion[15:55, 25:65] = np.maximum(drawn.motion[15:55, 25:65], 0.3)  # a faint rim
+    certain, faint = regions_of(drawn)
+    assert certain.bbox == (30, 20, 30, 30)
+    assert faint.bbox == (80, 60, 30, 20)
+    assert (certain.label, faint.label) == ("independent_motion", "model_error")
+    assert faint.score == pytest.approx(0.3, abs=1e-3)
+    assert len(regions_of(drawn, RegionConfig(faint_motion_probability=0.5))) == 1
 
 
 def test_two_that_touch_are_cut_along_their_seam() -> None:

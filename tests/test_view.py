@@ -241,12 +241,26 @@ def test_the_same_camera_gives_the_same_view_object() -> None:
     assert make_view(WHOLE, width=752, height=480, camera=EUROC) is first
 
 
+def test_cells_of_blocks_are_looked_up_once_for_each_size() -> None:
+    lens = make_view(WHOLE, width=512, height=512, camera=FISHEYE).lens
+    assert lens is not None
+    shape = tuple(side // 4 for side in lens.source_of_view.shape[:2])
+    fine = lens.cells_of_blocks(shape, 4, 4)
+    assert lens.cells_of_blocks(shape, 4, 4) is fine
+    assert fine.shape == (128, 128, 2)
+    coarse = lens.cells_of_blocks(shape, 4, 8)
+    every_pixel = lens.cells_of_blocks(shape, 4, 1)
+    np.testing.assert_array_equal(coarse, every_pixel[4::8, 4::8])
+    np.testing.assert_array_equal(lens.cells_of_blocks(shape, 4, 4), fine)
+
+
 def test_a_view_says_what_it_holds() -> None:
     view = make_view(WHOLE, width=512, height=512, camera=FISHEYE)
     assert view.lens is not None
     mask = view.analyzed()
     assert mask is not None
-    tables = view.lens.source_of_view.nbytes + 2 * view.lens.view_of_source.nbytes
+    of_image = view.lens.view_of_source.nbytes
+    tables = view.lens.source_of_view.nbytes + 2 * of_image + of_image // 16
     assert view.held_bytes == tables + mask.nbytes
     assert make_view(WHOLE, width=320, height=240, camera=SCALED).held_bytes == 0
 

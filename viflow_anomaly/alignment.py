@@ -22,6 +22,8 @@ from viflow_anomaly.measured_flow import RemainingFlow, measure_remaining_flow
 from viflow_anomaly.motion_refinement import common_motion_px
 from viflow_anomaly.sensor_data import FramePair, Uint8Array
 
+NO_GRAY = np.zeros(4)
+"""Added, so that OpenCV rounds and clips to whole gray levels."""
 HALF_TEXTURE_GRAY2 = 8.0
 """Of a block whose measured flow is half trusted."""
 MIN_SHIFT_PX = 0.5
@@ -81,8 +83,8 @@ def align(pair: FramePair, explained: Explanation, config: DetectorConfig, *, fo
     geometry = block_geometry(explained.predicted, explained.model_input.view, focal_px)
     source, log_depth = padded(explained.source), np.zeros_like(geometry.log_ratio)
     for rebuilds_left in range(MAX_REBUILDS, -1, -1):
-        inside = padded(explained.inside.astype(np.uint8), outside=True)
-        rebuilt = padded(np.clip(np.rint(explained.reconstruction), 0, 255).astype(np.uint8))
+        inside = padded(explained.inside.view(np.uint8), outside=True)
+        rebuilt = padded(np.asarray(cv2.add(explained.reconstruction, NO_GRAY, dtype=cv2.CV_8U), dtype=np.uint8))
         np.copyto(rebuilt, source, where=inside == 0)
         blocks = log_depth.shape[::-1]
         inside_share = np.asarray(cv2.resize(inside * np.float32(1), blocks, interpolation=cv2.INTER_AREA), np.float32)

@@ -68,10 +68,15 @@ def block_geometry(predicted: PredictedFlow, view: InternalView, focal_px: float
     log_depth = np.log(np.maximum(correction.inverse_depth, MIN_INVERSE_DEPTH))
     log_ratio = np.zeros_like(log_depth) if correction.log_depth_ratio is None else correction.log_depth_ratio
     slope = moved.slope * (np.array(view.step_px, dtype=np.float32) * np.float32(focal_px))
-    first = on_blocks(np.dstack([slope, log_ratio, log_depth]), predicted, view)
-    second = on_blocks(np.dstack([moved.x, moved.y, moved.nearness]), predicted, view)
+    first = on_blocks(_merged(*cv2.split(slope), log_ratio, log_depth), predicted, view)
+    second = on_blocks(_merged(moved.x, moved.y, moved.nearness), predicted, view)
     points = MovedPoints(*(np.ascontiguousarray(second[..., axis]) for axis in range(3)))
     return BlockGeometry(_epipolar_lines(first[..., :2]), first[..., 2], first[..., 3], points, focal)
+
+
+def _merged(*planes: NDArray[Any]) -> Float32Array:
+    """[h, w, C] of [h, w] each."""
+    return np.asarray(cv2.merge(planes), dtype=np.float32)
 
 
 def on_blocks(cells: Float32Array, predicted: PredictedFlow, view: InternalView) -> Float32Array:

@@ -220,6 +220,9 @@ class RegionConfig(FrozenConfig):
     min_motion_probability: float = Field(
         default=0.5, ge=0.01, le=0.99, description="of a pixel, with learned evidence"
     )
+    faint_motion_probability: float = Field(
+        default=0.15, ge=0.01, le=0.99, description="of the pixels of a thing that nowhere reaches the other"
+    )
     opening_fraction: float = Field(default=0.004, ge=0, le=0.1)
     closing_fraction: float = Field(default=0.012, ge=0, le=0.1)
     min_area_fraction: float = Field(default=0.0006, ge=0, le=1, description="of the image's area")

@@ -79,25 +79,39 @@ def rigid_flow_px(
     rays: Float32Array, inverse_depth: Float32Array, motion: RigidMotion, focal_px: float
 ) -> Float32Array:
     """Flow [..., 2] of a static world; rays [..., 2] in focal lengths, inverse_depth [...]."""
-    x, y = rays[..., 0], rays[..., 1]
-    moved_x, moved_y, _ = _moved(x, y, inverse_depth, motion)
-    flow = np.empty_like(rays)
-    np.subtract(moved_x, x, out=flow[..., 0])
-    np.subtract(moved_y, y, out=flow[..., 1])
-    flow *= np.float32(focal_px)
+    return _flow_px(_points(rays, inverse_depth), motion, focal_px)
+
+
+def _points(rays: Float32Array, inverse_depth: Float32Array) -> Float32Array:
+    """[4, ...]: x, y, 1 and the inverse depth, in which a motion is linear."""
+    points = np.empty((4, *inverse_depth.shape), dtype=np.float32)
+    points[0], points[1] = rays[..., 0], rays[..., 1]
+    points[2] = 1
+    points[3] = inverse_depth
+    return points
+
+
+def _flow_px(points: Float32Array, motion: RigidMotion, focal_px: float) -> Float32Array:
+    """``rigid_flow_px`` of points [4, ...]."""
+    moved = _moved(points, motion)
+    moved[:2] -= points[:2]
+    moved[:2] *= np.float32(focal_px)
+    flow = np.empty((*points.shape[1:], 2), dtype=np.float32)
+    flow[..., 0], flow[..., 1] = moved[0], moved[1]
     return flow
 
 
-def _moved(
-    x: Float32Array, y: Float32Array, inverse_depth: Float32Array, motion: RigidMotion
-) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """(x, y) of every ray after the motion, and its inverse depth there."""
-    rotation, translation = motion.rotation.astype(np.float32), motion.translation.astype(np.float32)
-    px, py, pz = (
-        row[0] * x + row[1] * y + row[2] + inverse_depth * t for row, t in zip(rotation, translation, strict=True)
-    )
-    nearness = 1 / np.maximum(pz, np.float32(MIN_DEPTH_RATIO))
-    return px * nearness, py * nearness, inverse_depth * nearness
+def _moved(points: Float32Array, motion: RigidMotion) -> Float32Array:
+    """[3, ...]: x and y of every point after the motion, and its inverse depth there."""
+    matrix = np.empty((3, 4), dtype=np.float32)
+    matrix[:, :3], matrix[:, 3] = motion.rotation, motion.translation
+    moved: Float32Array = (matrix @ points.reshape(4, -1)).reshape(3, *points.shape[1:])
+    nearness = moved[2]
+    np.maximum(nearness, np.float32(MIN_DEPTH_RATIO), out=nearness)
+    np.divide(np.float32(1), nearness, out=nearness)
+    moved[:2] *= nearness
+    nearness *= points[3]
+    return moved
 
 
 class _NormalEquations(NamedTuple):
@@ -126,27 +140,26 @@ def correct_motion(
         config: how far and how hard.
     """
     thin = _lattice(measured, config)
-    x, y = (np.ascontiguousarray(rays[thin][..., axis]).reshape(-1) for axis in (0, 1))
-    depth = np.ascontiguousarray(inverse_depth[thin]).reshape(-1)
-    goal = measured.flow_px[thin].reshape(-1, 2).T / np.float32(focal_px) + (x, y)  # 2, N
+    cells = _points(rays, inverse_depth)
+    points = cells[:, *thin].reshape(4, -1)
+    goal = measured.flow_px[thin].reshape(-1, 2).T / np.float32(focal_px) + points[:2]  # 2, N
     confidence = measured.confidence[thin].reshape(-1)
     prior = _prior(config)
     motion, turned = start, np.zeros(3)
     turn: MeasuredTurn | None = None
-    jacobian = np.zeros((2, 6, x.size), dtype=np.float32)
+    jacobian = np.zeros((6, *goal.shape), dtype=np.float32)
     for round_ in range(config.rounds):
-        moved_x, moved_y, nearness = _moved(x, y, depth, motion)
-        error = goal - (moved_x, moved_y)
+        moved = _moved(points, motion)
+        error = goal - moved[:2]
         weights = robust_weights(error, confidence, _tolerance(config, round_) / focal_px)
-        _fill_jacobian(jacobian, moved_x, moved_y, nearness)
+        _fill_jacobian(jacobian, *moved)
         equations = _normal_equations(jacobian, error, weights)
         if round_ == config.rounds - 1:
             turn = _measured_turn(equations, prior, turned)
         step = _solved(equations, prior, _pull(prior, turned))
         turned = turned + step[:3]
         motion = RigidMotion(so3_exp(step[:3]) @ motion.rotation, motion.translation + step[3:])
-    before = rigid_flow_px(rays, inverse_depth, start, focal_px)
-    after = rigid_flow_px(rays, inverse_depth, motion, focal_px)
+    before, after = (_flow_px(cells, one, focal_px) for one in (start, motion))
     corrected = _accepted(before, after, measured, config, start, motion)
     corrected = corrected._replace(
         inverse_depth=inverse_depth,
@@ -156,7 +169,7 @@ def correct_motion(
     )
     if not corrected.converged or not config.depth_rounds:
         return corrected
-    log_ratio = _log_depth_ratio(rays, inverse_depth, motion, measured, focal_px, config)
+    log_ratio = _log_depth_ratio(cells, motion, measured, focal_px, config)
     refined = np.asarray(inverse_depth * np.exp(log_ratio), dtype=np.float32)
     flow_px = rigid_flow_px(rays, refined, motion, focal_px)
     share, _ = _inlier_share(flow_px, measured, config)
@@ -179,48 +192,51 @@ class MovedCells(NamedTuple):
 
 def moved_cells(rays: Float32Array, inverse_depth: Float32Array, motion: RigidMotion) -> MovedCells:
     """Where the cells of rays [h, w, 2] go."""
-    moved = _moved(rays[..., 0], rays[..., 1], inverse_depth, motion)
-    return MovedCells(*moved, _slope(moved, motion))
+    moved = _moved(_points(rays, inverse_depth), motion)
+    return MovedCells(moved[0], moved[1], moved[2], np.stack(list(_slope(moved, motion)), axis=-1))
 
 
-def _slope(moved: tuple[Float32Array, Float32Array, Float32Array], motion: RigidMotion) -> Float32Array:
-    x, y, nearness = moved
+def _slope(moved: Float32Array, motion: RigidMotion) -> Float32Array:
+    """[2, ...], of ``MovedCells``."""
     t = motion.translation.astype(np.float32)
-    return np.stack([nearness * (t[0] - x * t[2]), nearness * (t[1] - y * t[2])], axis=-1)
+    slope: Float32Array = moved[:2] * -t[2]
+    slope[0] += t[0]
+    slope[1] += t[1]
+    slope *= moved[2]
+    return slope
 
 
 def _log_depth_ratio(
-    rays: Float32Array,
-    inverse_depth: Float32Array,
-    motion: RigidMotion,
-    measured: MeasuredFlow,
-    focal_px: float,
-    config: CorrectionConfig,
+    cells: Float32Array, motion: RigidMotion, measured: MeasuredFlow, focal_px: float, config: CorrectionConfig
 ) -> Float32Array:
-    """[h, w] what the inverse depth's logarithm changes by to explain the parallax, see ``depth_refinement``."""
-    x, y = np.ascontiguousarray(rays[..., 0]), np.ascontiguousarray(rays[..., 1])
-    goal = measured.flow_px / np.float32(focal_px) + rays
-    log_ratio = np.zeros_like(inverse_depth)
+    """[h, w] what the inverse depth's logarithm changes by to explain the parallax, see ``depth_refinement``.
+
+    ``cells`` are ``_points``.
+    """
+    goal = measured.flow_px.transpose(2, 0, 1) / np.float32(focal_px) + cells[:2]
+    points = cells.copy()
+    log_ratio: Float32Array = np.zeros_like(cells[3])
     for _ in range(config.depth_rounds):
-        moved = _moved(x, y, inverse_depth * np.exp(log_ratio), motion)
-        parallax = Parallax(goal - np.stack(moved[:2], axis=-1), _slope(moved, motion))
+        np.multiply(cells[3], np.exp(log_ratio), out=points[3])
+        moved = _moved(points, motion)
+        parallax = Parallax(goal - moved[:2], _slope(moved, motion))
         log_ratio = log_depth_step(parallax, measured, log_ratio, config.tolerance_px / focal_px)
     return log_ratio
 
 
 def _fill_jacobian(jacobian: Float32Array, x: Float32Array, y: Float32Array, nearness: Float32Array) -> None:
-    """[2, 6, N]: how (x, y) after the motion follow a further rotation and translation of the camera."""
+    """[6, 2, N]: how (x, y) after the motion follow a further rotation and translation of the camera."""
     xy = x * y
     np.negative(xy, out=jacobian[0, 0])
-    np.add(x * x, 1, out=jacobian[0, 1])
-    np.negative(y, out=jacobian[0, 2])
-    jacobian[0, 3] = nearness
-    np.multiply(nearness, -x, out=jacobian[0, 5])
-    np.subtract(-1, y * y, out=jacobian[1, 0])
+    np.add(x * x, 1, out=jacobian[1, 0])
+    np.negative(y, out=jacobian[2, 0])
+    jacobian[3, 0] = nearness
+    np.multiply(nearness, -x, out=jacobian[5, 0])
+    np.subtract(-1, y * y, out=jacobian[0, 1])
     jacobian[1, 1] = xy
-    jacobian[1, 2] = x
-    jacobian[1, 4] = nearness
-    np.multiply(nearness, -y, out=jacobian[1, 5])
+    jacobian[2, 1] = x
+    jacobian[4, 1] = nearness
+    np.multiply(nearness, -y, out=jacobian[5, 1])
 
 
 def _prior(config: CorrectionConfig) -> Float64Array:
@@ -255,19 +271,19 @@ def correct_flow(
     x, y = rays[..., 0], rays[..., 1]
     turns = [np.stack(one) for one in ((-x * y, -1 - y * y), (1 + x * x, x * y), (-y, x))]
     others = [(one - start).transpose(2, 0, 1) / focal_px for k, one in enumerate(hypotheses_px) if k != winner]
-    basis = np.stack([*turns, *others], axis=1).astype(np.float32)  # 2, 3 + K - 1, h, w
-    prior = np.full(basis.shape[1], 1 / BLEND_SIGMA**2)
+    basis = np.stack([*turns, *others]).astype(np.float32)  # 3 + K - 1, 2, h, w
+    prior = np.full(len(basis), 1 / BLEND_SIGMA**2)
     prior[:3] = 1 / config.rotation_sigma_rad**2
     thin = _lattice(measured, config)
-    jacobian = basis[:, :, *thin].reshape(2, len(prior), -1)
+    jacobian = basis[:, :, *thin].reshape(len(prior), 2, -1)
     goal = ((measured.flow_px - start)[thin] / np.float32(focal_px)).reshape(-1, 2).T
     confidence = measured.confidence[thin].reshape(-1)
     solution = np.zeros(len(prior))
     for round_ in range(config.rounds):
-        error = goal - np.tensordot(solution.astype(np.float32), jacobian, (0, 1))
+        error = goal - np.tensordot(solution.astype(np.float32), jacobian, 1)
         weights = robust_weights(error, confidence, _tolerance(config, round_) / focal_px)
         solution = _weighted_step(jacobian, goal, weights, prior, np.zeros(len(prior)))
-    shift = np.tensordot(solution.astype(np.float32), basis, (0, 1)).transpose(1, 2, 0)
+    shift = np.tensordot(solution.astype(np.float32), basis, 1).transpose(1, 2, 0)
     return _accepted(start, start + shift * np.float32(focal_px), measured, config, None, None)
 
 
@@ -294,15 +310,15 @@ def robust_weights(error: Float32Array, confidence: Float32Array, tolerance: flo
 def _weighted_step(
     jacobian: Float32Array, error: Float32Array, weights: Float32Array, prior: Float64Array, pull: Float64Array
 ) -> Float64Array:
-    """Solve the normal equations of jacobian [2, P, N] and error [2, N], both in focal lengths."""
+    """Solve the normal equations of jacobian [P, 2, N] and error [2, N], both in focal lengths."""
     return _solved(_normal_equations(jacobian, error, weights), prior, pull)
 
 
 def _normal_equations(jacobian: Float32Array, error: Float32Array, weights: Float32Array) -> _NormalEquations:
-    weighted = jacobian * (weights * np.float32(1 / NOISE_RAY**2))
-    normal = (weighted[0] @ jacobian[0].T + weighted[1] @ jacobian[1].T).astype(np.float64)
-    gradient = (weighted[0] @ error[0] + weighted[1] @ error[1]).astype(np.float64)
-    return _NormalEquations(normal, gradient)
+    rows = jacobian.reshape(len(jacobian), -1)
+    weighted = (jacobian * (weights * np.float32(1 / NOISE_RAY**2))).reshape(rows.shape)
+    normal, gradient = weighted @ rows.T, weighted @ error.reshape(-1)
+    return _NormalEquations(normal.astype(np.float64), gradient.astype(np.float64))
 
 
 def _solved(equations: _NormalEquations, prior: Float64Array, pull: Float64Array) -> Float64Array:

@@ -62,12 +62,12 @@ class Analysis(NamedTuple):
         detection: what ``detect`` returns.
         residual: [H, W] float32 photometric residual in gray levels at the source image's size.
         evidence: [H, W] float32 what regions are found in: probabilities of motion 0..1 (learned evidence), or the
-            residual, normalised by texture.
+            residual, normalised by texture. The head does not look at a pair that is not judged: probabilities are 0.
         inside: [H, W] analysed pixels that are still in the target image; elsewhere nothing is found.
         reconstruction: [H, W] float32 source image rebuilt from the target.
         target_coordinates: [H, W, 2] float32 where each source pixel is predicted in the target image.
         predicted: the flow they come from, in the network's view, and its correction.
-        learned: the evidence head judged this pair, so that ``evidence`` are probabilities.
+        learned: this is a pair for the evidence head, so that ``evidence`` are probabilities.
     """
 
     detection: Detection
@@ -197,24 +197,19 @@ class AnomalyDetector:
         """``detect`` with its maps; same errors. The paper's algorithm on one screen."""
         started = time.perf_counter()
         explained = self._explain(pair)
-        explained, judged = self._judge(pair, explained)
-        model_input, predicted = explained.model_input, explained.predicted
-        residual, inside = explained.residual, explained.inside
+        findings = self._findings(pair, explained)
+        abstained, judged = any(finding.abstain for finding in findings), None
+        learned = takes_head(self._evidence, explained, self.config)
+        if learned and not abstained:
+            explained, judged = self._judge(pair, explained)
+            if judged is not None and not judged.maps.finite:
+                findings, abstained = (*findings, Finding(HEAD_NOT_FINITE, abstain=True)), True
         inferred = time.perf_counter()
-        x, y, region_width, region_height = model_input.view.region()
-        summary = _summary(residual, inside, self.config.min_overlap, region_width * region_height)
-        findings = _judge_input(pair, model_input.window, self.config)
-        if summary is None:
-            finite = bool(np.isfinite(predicted.flow_px).all())
-            findings = (*findings, Finding(NOTHING_IN_COMMON if finite else NOT_FINITE, abstain=True))
-        elif judged is not None and not judged.maps.finite:
-            findings = (*findings, Finding(HEAD_NOT_FINITE, abstain=True))
-        elif not any(finding.abstain for finding in findings):
-            findings = (*findings, *_doubts(predicted, model_input.window, self.config))
-        abstained = any(finding.abstain for finding in findings)
+        residual = explained.residual
+        height, width = residual.shape
+        image = ImageSize(width=width, height=height)
         rois: tuple[Roi, ...] = ()
         if not abstained:
-            image = ImageSize(width=residual.shape[1], height=residual.shape[0])
             regions = regions_of(explained, judged, self._evidence, self.config)
             rois = rois_from_regions(
                 regions, image, include_masks=self.config.include_masks, target_coordinates=explained.target_coordinates
@@ -226,22 +221,39 @@ class AnomalyDetector:
             "regions": (finished - inferred) * 1e3,
             "total": decode_ms + (finished - started) * 1e3,
         }
-        height, width = residual.shape
+        x, y, region_width, region_height = explained.model_input.view.region()
         detection = Detection(
             source_timestamp_ns=pair.source.timestamp_ns,
             target_timestamp_ns=pair.target.timestamp_ns,
-            image=ImageSize(width=width, height=height),
+            image=image,
             status="abstained" if abstained else "ok",
             reasons=tuple(finding.reason for finding in findings),
             model=self.model_info,
             rois=rois,
             region_analyzed=AnalyzedRegion(x=x, y=y, width=region_width, height=region_height),
-            residual=summary,
+            residual=self._summary(explained),
             timings_ms=timings_ms,
         )
-        evidence = explained.normalised if judged is None else judged.maps.motion
-        maps = (residual, evidence, inside, explained.reconstruction, explained.target_coordinates)
-        return Analysis(detection, *maps, predicted, learned=judged is not None)
+        nothing = np.zeros_like(residual) if learned else explained.normalised
+        evidence = nothing if judged is None else judged.maps.motion
+        maps = (residual, evidence, explained.inside, explained.reconstruction, explained.target_coordinates)
+        return Analysis(detection, *maps, explained.predicted, learned=learned)
+
+    def _findings(self, pair: FramePair, explained: Explanation) -> tuple[Finding, ...]:
+        """What can be said against the pair, and whether it can be judged at all."""
+        window, predicted = explained.model_input.window, explained.predicted
+        findings = _judge_input(pair, window, self.config)
+        if self._summary(explained) is None:
+            finite = bool(np.isfinite(predicted.flow_px).all())
+            return (*findings, Finding(NOTHING_IN_COMMON if finite else NOT_FINITE, abstain=True))
+        if any(finding.abstain for finding in findings):
+            return findings
+        return (*findings, *_doubts(predicted, window, self.config))
+
+    def _summary(self, explained: Explanation) -> ResidualSummary | None:
+        """None where hardly anything of what is analysed is still in the target image."""
+        _, _, width, height = explained.model_input.view.region()
+        return _summary(explained.residual, explained.inside, self.config.min_overlap, width * height)
 
     def judge_cues(self, pair: FramePair) -> tuple[JudgedCues, NDArray[np.bool_]] | None:
         """What the head says of a pair, and which pixels [H, W] are inside; None where regions come from the residual.

@@ -12,9 +12,11 @@ import numpy as np
 
 from viflow_anomaly.config import EVIDENCE_BLOCK_PX
 from viflow_anomaly.geometry import Float32Array
-from viflow_anomaly.regions import IndexArray
+from viflow_anomaly.regions import IndexArray, LabelArray
 from viflow_anomaly.sensor_data import Float64Array
 
+MAX_DIVIDED = 64
+"""Of a picture full of specks no more than so many, the largest, are looked at."""
 MIN_BLOCKS = 6
 """A component of fewer is one thing."""
 REACH = 0.5
@@ -63,21 +65,30 @@ def things_of_blocks(rows: IndexArray, columns: IndexArray, offsets: Float32Arra
     return np.asarray(np.unique(distances.argmin(axis=1), return_inverse=True)[1], dtype=np.intp)
 
 
-def things_of_pixels(labels: IndexArray, offsets: Float32Array, origin: tuple[int, int]) -> IndexArray:
-    """[H, W] components (1..) divided into things (1..).
+def things_of_pixels(labels: LabelArray, offsets: Float32Array, origin: tuple[int, int]) -> LabelArray:
+    """[H, W] components (1..) divided into things (1..); the largest keep their component's number.
 
     Args:
         labels: [H, W] components, 0 is none; a cut-out of the image.
         offsets: [2, h, w] of the whole image's blocks.
         origin: row and column of the cut-out's first pixel in the image.
     """
-    things = np.zeros_like(labels)
-    made = 0
-    for component in range(1, int(labels.max()) + 1):
-        y, x = np.nonzero(labels == component)
-        blocks = ((y + origin[0]) // EVIDENCE_BLOCK_PX) * offsets.shape[2] + (x + origin[1]) // EVIDENCE_BLOCK_PX
+    at = np.flatnonzero(labels)
+    component = labels.reshape(-1)[at]
+    areas_px = np.bincount(component, minlength=1)
+    largest = np.argsort(-areas_px, kind="stable")[:MAX_DIVIDED]
+    divided = largest[areas_px[largest] >= MIN_BLOCKS * EVIDENCE_BLOCK_PX**2]
+    if not divided.size:
+        return labels
+    things, made = labels.copy(), len(areas_px) - 1
+    by_component = at[np.argsort(component, kind="stable")]
+    ends = np.cumsum(areas_px)
+    for number in divided:
+        pixels = by_component[ends[number] - areas_px[number] : ends[number]]
+        rows, columns = pixels // labels.shape[1] + origin[0], pixels % labels.shape[1] + origin[1]
+        blocks = (rows // EVIDENCE_BLOCK_PX) * offsets.shape[2] + columns // EVIDENCE_BLOCK_PX
         own, which = np.unique(blocks, return_inverse=True)
-        thing = things_of_blocks(own // offsets.shape[2], own % offsets.shape[2], offsets)
-        things[y, x] = made + 1 + thing[which]
-        made += int(thing.max()) + 1
+        thing = things_of_blocks(own // offsets.shape[2], own % offsets.shape[2], offsets)[which]
+        things.reshape(-1)[pixels] = np.where(thing == 0, number, made + thing)
+        made += int(thing.max())
     return things

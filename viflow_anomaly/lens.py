@@ -30,11 +30,13 @@ class _CellMaps(NamedTuple):
         cells_of_source: [H, W, 2] flow cell of every source pixel.
         from_middle: [h, w, 2] view pixels of each cell from the view's middle.
         source: [h, w, 2] source pixel of each cell.
+        of_blocks: by a block's sides, [rows, columns, 2] the flow cell of the middle of each block of source pixels.
     """
 
     cells_of_source: Float32Array
     from_middle: Float32Array
     source: Float32Array
+    of_blocks: dict[int, Float32Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +58,8 @@ class LensMaps:
 
     @property
     def held_bytes(self) -> int:
-        """Of all tables, those that a first flow will add included."""
-        return self.source_of_view.nbytes + 2 * self.view_of_source.nbytes
+        """Of all tables, those that a first flow will add included (of its blocks: a sixteenth)."""
+        return self.source_of_view.nbytes + self.view_of_source.nbytes * 33 // 16
 
     def spread(self, flow_view_px: Float32Array, stride: int) -> Float32Array:
         """Flow of the ideal view on cells [h', w', 2] -> flow of every distorted source pixel [H, W, 2]."""
@@ -68,9 +70,15 @@ class LensMaps:
 
     def cells_of_blocks(self, shape: tuple[int, ...], stride: int, block_px: int) -> Float32Array:
         """[rows, columns, 2]: flow cell of the middle of each block of ``block_px`` source pixels."""
-        cells = self._cell_maps(shape, stride).cells_of_source
-        rows, columns = (np.minimum(np.arange(0, side, block_px) + block_px // 2, side - 1) for side in cells.shape[:2])
-        return np.asarray(cells[np.ix_(rows, columns)])
+        maps = self._cell_maps(shape, stride)
+        known = maps.of_blocks.get(block_px)
+        if known is None:
+            sides = maps.cells_of_source.shape[:2]
+            rows, columns = (np.minimum(np.arange(0, side, block_px) + block_px // 2, side - 1) for side in sides)
+            known = np.asarray(maps.cells_of_source[np.ix_(rows, columns)])
+            maps.of_blocks.clear()  # the evidence has one size of blocks
+            maps.of_blocks[block_px] = known
+        return known
 
     def _cell_maps(self, shape: tuple[int, ...], stride: int) -> _CellMaps:
         """Made once; two threads that make the same maps make the same values."""
@@ -83,7 +91,7 @@ class LensMaps:
             source = project_rays(self.camera, from_middle * self._to_ray()).astype(np.float32)
             cells = (self.view_of_source + half) / np.float32(stride) - half
             self._by_stride.clear()  # a network has one stride
-            maps = self._by_stride[stride] = _CellMaps(cells, from_middle, source)
+            maps = self._by_stride[stride] = _CellMaps(cells, from_middle, source, {})
         return maps
 
     def _to_ray(self) -> Float32Array:

@@ -29,6 +29,10 @@ MAX_LOCAL_STEP_PX = 4.0
 """Of the local refinement along x and along y: beyond it, gradients say nothing."""
 LOCAL_PRIOR_GRAY2 = 6.0
 """Added to the squared gradients: where there is no texture, nothing moves."""
+FIRST_OF_DOUBLED = np.array([0.25, 0.75, 0.0], dtype=np.float32)
+MEAN_OF_DOUBLED = np.array([0.125, 0.75, 0.125], dtype=np.float32)
+"""What bilinear doubling makes of an array: the first of each pixel's two; and, averaged over neighbours, the mean of
+each two pixels' four."""
 MIN_SIDE_PX = 32
 """Inverse search needs a few patches of 8 pixels along each side of its finest level."""
 
@@ -86,9 +90,17 @@ def measure_flow(
 def _confidence(source: Uint8Array, target: Uint8Array, flow_px: Float32Array, cells: tuple[int, int]) -> Float32Array:
     """[h, w] in 0..1: texture to measure by, and photometric agreement after the flow, on the halved views."""
     small_source, small_target = (_halved(image) for image in (source, target))
-    mismatch = _mismatch_gray(small_source, small_target, flow_px, cells) * np.float32(1 / MISMATCH_GRAY)
+    height, width = small_source.shape
+    at_px = np.asarray(cv2.resize(flow_px, (width, height), interpolation=cv2.INTER_NEAREST), dtype=np.float32)
+    at_px *= np.float32(0.5)
+    at_px += cached_pixel_grid(height, width)
+    mismatch = _mismatch_gray(small_source, small_target, at_px, cells)
+    mismatch *= np.float32(1 / MISMATCH_GRAY)
+    mismatch *= mismatch
+    mismatch += np.float32(1)
     texture = _texture(small_source, cells)
-    return np.asarray(texture / ((texture + np.float32(TEXTURE_GRAY2)) * (1 + mismatch * mismatch)), dtype=np.float32)
+    mismatch *= texture + np.float32(TEXTURE_GRAY2)
+    return np.divide(texture, mismatch, out=mismatch)
 
 
 def _halved(image: Uint8Array) -> Uint8Array:
@@ -97,12 +109,10 @@ def _halved(image: Uint8Array) -> Uint8Array:
 
 
 def _mismatch_gray(
-    small_source: Uint8Array, small_target: Uint8Array, flow_px: Float32Array, cells: tuple[int, int]
+    small_source: Uint8Array, small_target: Uint8Array, at_px: Float32Array, cells: tuple[int, int]
 ) -> Float32Array:
-    """[h, w] gray levels by which halved images differ after a flow, which is in whole pixels."""
-    height, width = small_source.shape
-    at = cv2.resize(flow_px, (width, height), interpolation=cv2.INTER_NEAREST) * np.float32(0.5)
-    matched = sample_bilinear(small_target, at + cached_pixel_grid(height, width), border=cv2.BORDER_CONSTANT)
+    """[h, w] gray levels by which halved images differ; each pixel of the source is at ``at_px`` in the target."""
+    matched = sample_bilinear(small_target, at_px, border=cv2.BORDER_CONSTANT)
     difference = cv2.absdiff(matched, small_source)
     return np.asarray(cv2.resize(difference, cells, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
@@ -138,34 +148,55 @@ def measure_remaining_flow(source: Uint8Array, rebuilt: Uint8Array, *, block_px:
         source, rebuilt: [H, W]; sides are multiples of ``block_px``, even, and at least ``MIN_SIDE_PX``.
         block_px: pixels for one value of the result.
     """
+    height, width = source.shape[0] // 2, source.shape[1] // 2
     blocks = (source.shape[1] // block_px, source.shape[0] // block_px)
-    search = _fast_search()
-    flow = np.asarray(search.calc(source, rebuilt, None), dtype=np.float32)
     small_source, small_rebuilt = (_halved(image) for image in (source, rebuilt))
+    # The search's own pyramid begins with the same halves: this is its flow before it is doubled in size, bilinearly;
+    # what follows is what the doubled one would say of every second pixel, and on average of each block.
+    half_px = np.asarray(_fast_search(finest_scale=0).calc(small_source, small_rebuilt, None), dtype=np.float32)
+    start_px = _filtered(half_px, FIRST_OF_DOUBLED)
+    at_px = start_px + cached_pixel_grid(height, width)
+    mean_px = cv2.resize(_filtered(half_px, MEAN_OF_DOUBLED), blocks, interpolation=cv2.INTER_AREA)
+    flow_px = np.multiply(mean_px, np.float32(2), out=mean_px)
     return RemainingFlow(
-        np.asarray(cv2.resize(flow, blocks, interpolation=cv2.INTER_AREA), dtype=np.float32),
-        _mismatch_gray(small_source, small_rebuilt, flow, blocks),
+        flow_px,
+        _mismatch_gray(small_source, small_rebuilt, at_px, blocks),
         _texture(small_source, blocks),
-        _local_flow(small_source, small_rebuilt, flow, blocks),
+        _local_flow(small_source, small_rebuilt, start_px, at_px, blocks),
     )
 
 
+def _filtered(flow_px: Float32Array, taps: Float32Array) -> Any:
+    """[h, w, 2] along x and along y; the border is repeated."""
+    return cv2.sepFilter2D(flow_px, cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REPLICATE)
+
+
 def _local_flow(
-    small_source: Uint8Array, small_rebuilt: Uint8Array, flow_px: Float32Array, blocks: tuple[int, int]
+    small_source: Uint8Array,
+    small_rebuilt: Uint8Array,
+    start_px: Float32Array,
+    at_px: Float32Array,
+    blocks: tuple[int, int],
 ) -> Float32Array:
-    """[h, w, 2] flow in whole pixels between halved images: one step of Lucas and Kanade (IJCAI 1981) on."""
-    source, rebuilt = small_source.astype(np.float32), small_rebuilt.astype(np.float32)
-    height, width = source.shape
-    start = cv2.resize(flow_px, (width, height), interpolation=cv2.INTER_NEAREST) * np.float32(0.5)
-    difference = sample_bilinear(rebuilt, start + cached_pixel_grid(height, width)) - source
+    """[h, w, 2] flow in whole pixels between halved images: one step of Lucas and Kanade (IJCAI 1981) on.
+
+    ``start_px`` is where the step begins, in halved pixels, and ``at_px`` that place in the rebuilt image.
+    """
+    source = small_source.astype(np.float32)
+    difference = sample_bilinear(small_rebuilt.astype(np.float32), at_px)
+    difference -= source
     dx, dy = (cv2.Scharr(source, cv2.CV_32F, *order, scale=1 / 32) for order in ((1, 0), (0, 1)))
-    xx, yy = (_windowed(one * one) + np.float32(LOCAL_PRIOR_GRAY2) for one in (dx, dy))
-    xy, x, y = (_windowed(one) for one in (dx * dy, dx * difference, dy * difference))
+    xx, yy, xy, x, y = (_windowed(a * b) for a, b in ((dx, dx), (dy, dy), (dx, dy), (dx, difference), (dy, difference)))
+    xx += np.float32(LOCAL_PRIOR_GRAY2)
+    yy += np.float32(LOCAL_PRIOR_GRAY2)
     scale = -1 / (xx * yy - xy * xy)
-    step = np.stack([scale * (yy * x - xy * y), scale * (xx * y - xy * x)], axis=-1)
     limit = np.float32(MAX_LOCAL_STEP_PX / 2)
-    flow = (start + np.clip(step, -limit, limit)) * np.float32(2)
-    return np.asarray(cv2.resize(flow, blocks, interpolation=cv2.INTER_AREA), dtype=np.float32)
+    steps = (np.clip(scale * along, -limit, limit) for along in (yy * x - xy * y, xx * y - xy * x))
+    flow = np.asarray(cv2.merge(list(steps)), dtype=np.float32)
+    flow += start_px
+    flow_px = np.asarray(cv2.resize(flow, blocks, interpolation=cv2.INTER_AREA), dtype=np.float32)
+    flow_px *= np.float32(2)
+    return flow_px
 
 
 def _windowed(values: Any) -> Float32Array:
@@ -178,9 +209,9 @@ def _thorough_search() -> Any:
     return search
 
 
-def _fast_search() -> Any:
+def _fast_search(finest_scale: int = FINEST_SCALE) -> Any:
     search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)  # type: ignore[attr-defined]
-    search.setFinestScale(FINEST_SCALE)
+    search.setFinestScale(finest_scale)
     search.setPatchStride(PATCH_STRIDE_PX)
     search.setGradientDescentIterations(DESCENT_STEPS)
     return search

@@ -166,7 +166,7 @@ def _coverage_tolerance_s(times_s: Float64Array) -> float:
     """
     if times_s.size < 2:
         return 0.0
-    return min(1.5 * float(np.median(np.diff(times_s))), MAX_COVERAGE_TOLERANCE_S)
+    return min(1.5 * float(np.median(times_s[1:] - times_s[:-1])), MAX_COVERAGE_TOLERANCE_S)
 
 
 def _require_coverage(times_s: Float64Array, interval_s: float) -> None:

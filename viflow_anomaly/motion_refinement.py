@@ -62,53 +62,48 @@ def common_motion_px(
         line: epipolar lines of the blocks, in source pixels.
         focal_px: of the source image, x and y.
     """
-    basis = _basis_px(points, focal_px)  # 2, 6, h, w
     thin = (slice(LATTICE_BLOCKS // 2, None, LATTICE_BLOCKS),) * 2
-    jacobian = basis[:, :, *thin].reshape(2, 6, -1)
+    x, y, nearness = (one[thin].reshape(-1) for one in points)
+    along_x, along_y = _basis_px(MovedPoints(x, y, nearness), focal_px)  # 6, N each
     u, v = (flow_px[..., axis][thin].reshape(-1) for axis in (0, 1))
     lx, ly, parallax = (one[thin].reshape(-1) for one in line)
-    rows_across = jacobian[1] * lx - jacobian[0] * ly
-    rows_along = jacobian[0] * lx + jacobian[1] * ly
-    across, along = v * lx - u * ly, u * lx + v * ly
-    trusted = trust[thin].reshape(-1)
+    # First all that lies across the lines, then all along them.
+    rows = np.concatenate([along_y * lx - along_x * ly, along_x * lx + along_y * ly], axis=1)  # 6, 2 N
+    goal = np.concatenate([v * lx - u * ly, u * lx + v * ly])
     share = 1 / (1 + (parallax / np.float32(FREE_PARALLAX_PX)) ** 2)
-    free = trusted * share
-    prior = np.repeat([1 / ROTATION_SIGMA_RAD**2, 1 / TRANSLATION_SIGMA**2], 3)
+    trusted = trust[thin].reshape(-1) * np.float32(1 / (NOISE_PX**2 * CORRELATED_BLOCKS))
+    trusted = np.stack([trusted, trusted * share])
+    prior = np.diag(np.repeat([1 / ROTATION_SIGMA_RAD**2, 1 / TRANSLATION_SIGMA**2], 3))
     solution = np.zeros(6)
     for _ in range(ROUNDS):
-        moved = solution.astype(np.float32)
-        error_across, error_along = across - moved @ rows_across, along - moved @ rows_along
-        size = np.sqrt(error_across**2 + error_along**2 * share)
+        across, along = (goal - solution.astype(np.float32) @ rows).reshape(2, -1)
+        size = np.sqrt(across * across + along * along * share)
         tolerance = max(MIN_TOLERANCE_PX, float(np.median(size)))
         robust = 1 / (1 + (size / np.float32(tolerance)) ** 2)
-        solution = _solved(rows_across, across, trusted * robust, rows_along, along, free * robust, prior)
-    return np.tensordot(solution.astype(np.float32), basis, (0, 1)).transpose(1, 2, 0)
+        weighted = rows * (trusted * robust).reshape(-1)
+        normal = prior + (weighted @ rows.T).astype(np.float64)
+        solution = np.asarray(np.linalg.solve(normal, (weighted @ goal).astype(np.float64)))
+    return _moved_px(points, solution, focal_px)
 
 
-def _solved(
-    rows_across: Float32Array,
-    across: Float32Array,
-    weights_across: Float32Array,
-    rows_along: Float32Array,
-    along: Float32Array,
-    weights_along: Float32Array,
-    prior: Float64Array,
-) -> Float64Array:
-    """[6] rotation (rad) and translation: rows [6, N] and goals [N] in pixels, prior [6] inverse variances."""
-    normal = np.diag(prior)
-    gradient = np.zeros(6)
-    for rows, goal, weights in ((rows_across, across, weights_across), (rows_along, along, weights_along)):
-        weighted = rows * (weights * np.float32(1 / (NOISE_PX**2 * CORRELATED_BLOCKS)))
-        normal = normal + (weighted @ rows.T).astype(np.float64)
-        gradient = gradient + (weighted @ goal).astype(np.float64)
-    return np.asarray(np.linalg.solve(normal, gradient))
-
-
-def _basis_px(points: MovedPoints, focal_px: tuple[float, float]) -> Float32Array:
-    """[2, 6, h, w] how flow in pixels follows a further rotation and translation of the camera."""
+def _basis_px(points: MovedPoints, focal_px: tuple[float, float]) -> tuple[Float32Array, Float32Array]:
+    """[6, N] each: how flow in pixels along x and along y follows a further rotation and translation of the camera."""
     x, y, nearness = points
     fx, fy = (np.float32(focal) for focal in focal_px)
     zero = np.zeros_like(x)
-    along_x = (-x * y, 1 + x * x, -y, nearness, zero, -x * nearness)
-    along_y = (-1 - y * y, x * y, x, zero, nearness, -y * nearness)
-    return np.stack([np.stack(along_x) * fx, np.stack(along_y) * fy]).astype(np.float32)
+    along_x = np.stack([-x * y, 1 + x * x, -y, nearness, zero, -x * nearness])
+    along_y = np.stack([-1 - y * y, x * y, x, zero, nearness, -y * nearness])
+    along_x *= fx
+    along_y *= fy
+    return along_x, along_y
+
+
+def _moved_px(points: MovedPoints, solution: Float64Array, focal_px: tuple[float, float]) -> Float32Array:
+    """[h, w, 2] the flow of points under a small rotation and translation [6]: their basis times these."""
+    x, y, nearness = points
+    rx, ry, rz, tx, ty, tz = solution.astype(np.float32)
+    common = x * ry - y * rx - nearness * tz
+    flow = np.empty((*x.shape, 2), dtype=np.float32)
+    np.multiply(x * common - y * rz + nearness * tx + ry, np.float32(focal_px[0]), out=flow[..., 0])
+    np.multiply(y * common + x * rz + nearness * ty - rx, np.float32(focal_px[1]), out=flow[..., 1])
+    return flow

@@ -21,7 +21,7 @@ from viflow_anomaly.regions import (
     BoolArray,
     BoundingBox,
     Component,
-    IndexArray,
+    LabelArray,
     Region,
     largest_components,
     pixels_of,
@@ -89,13 +89,13 @@ def measure_regions(
     maps: MotionMaps, cues: EvidenceCues, inside: BoolArray, config: RegionConfig
 ) -> list[MeasuredRegion]:
     """Connected regions that probably move, largest first; arguments as in ``find_moving_regions``."""
-    mask = (maps.motion > config.min_motion_probability) & inside
+    mask = (maps.motion > min(config.min_motion_probability, config.faint_motion_probability)) & inside
     left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
     if not width:
         return []
     part = (slice(top, top + height), slice(left, left + width))
     y, x = pixels_of(mask[part])
-    labels = things_of_pixels(_labels(mask[part], maps.seam_logit[part]), maps.offsets, (top, left))[y, x]
+    labels = _things(maps, mask[part], part, config)[mask[part]]
     components = largest_components(y + top, x + left, labels, mask.size, config)
     limits = shape_limits(config, float(np.hypot(*mask.shape)))
     measured = []
@@ -103,7 +103,7 @@ def measure_regions(
         box, outline = component.outline()
         thickness = thickness_px(outline)
         shape = judge_shape(config.shape_rule, outline, thickness, limits)
-        features = _features(component, maps, cues, outline, shape)
+        features = _features(component, box, maps, cues, outline, shape)
         measured.append(MeasuredRegion(component, box, outline, thickness, shape, features))
     return measured
 
@@ -135,31 +135,52 @@ def find_moving_regions(
 
 
 def _judge(measured: MeasuredRegion, residual: Float32Array, score: RegionScore, config: RegionConfig) -> Region:
-    component, box, outline, thickness, shape, features = measured
+    _, box, outline, thickness, shape, features = measured
     probability = probability_of(features, score)
     if not shape.passes:
         probability = min(probability, BAND_SCORE)
     moves = shape.passes and probability >= config.motion_score
-    values = residual[component.y, component.x]
+    values = residual[box.pixels][outline]
     evidence = _evidence(features, shape, box.width / box.height, config)
     return region_of(values, box, outline, moves=moves, score=probability, thickness_px=thickness, evidence=evidence)
 
 
-def _labels(mask: BoolArray, seam_logit: Float32Array) -> IndexArray:
+def _things(maps: MotionMaps, mask: BoolArray, part: tuple[slice, slice], config: RegionConfig) -> LabelArray:
+    """[h, w] things (1..) in a part of the image: those that somewhere probably move, divided, and the faint ones.
+
+    A faint thing is what reaches ``faint_motion_probability`` and has no more than a speck that is certain; small and
+    slow things are no more than that.
+    """
+    certain = mask & (maps.motion[part] > config.min_motion_probability)
+    things, faint = (_divided(maps, one, part) for one in (certain, mask))
+    is_new = np.bincount(faint[certain], minlength=int(faint.max()) + 1) < config.min_area_fraction * maps.motion.size
+    is_new[0] = False
+    return np.where(is_new[faint], faint + things.max(), things)
+
+
+def _divided(maps: MotionMaps, mask: BoolArray, part: tuple[slice, slice]) -> LabelArray:
+    """[h, w] things (1..) of a mask over a part of the image."""
+    return things_of_pixels(_labels(mask, maps.seam_logit[part]), maps.offsets, (part[0].start, part[1].start))
+
+
+def _labels(mask: BoolArray, seam_logit: Float32Array) -> LabelArray:
     """[H, W] components (1..) of the mask, cut along seams; what is left of a seam joins no component."""
     cut = mask & (seam_logit > SEAM_LOGIT)
-    labels = np.asarray(label_components(mask & ~cut, connectivity=2))  # type: ignore[no-untyped-call]
-    if not cut.any() or labels.max() > np.iinfo(np.uint16).max:
-        return labels.astype(np.intp)
-    grown = labels.astype(np.uint16)
-    block = np.ones((3, 3), np.uint8)
+    labels, count = label_components(mask & ~cut, connectivity=2, return_num=True)  # type: ignore[no-untyped-call]
+    left, top, width, height = cv2.boundingRect(cut.view(np.uint8))
+    if not width or count > np.iinfo(np.uint16).max:
+        return np.asarray(labels)
+    # Only seams change, and one pixel around them is all that they change by.
+    near = (slice(max(top - 1, 0), top + height + 1), slice(max(left - 1, 0), left + width + 1))
+    seams, grown, block = cut[near], labels[near].astype(np.uint16), np.ones((3, 3), np.uint8)
     for _ in range(SEAM_REACH_PX):
-        np.copyto(grown, np.asarray(cv2.dilate(grown, block), np.uint16), where=cut & (grown == 0))
-    return grown.astype(np.intp)
+        np.copyto(grown, np.asarray(cv2.dilate(grown, block), np.uint16), where=seams & (grown == 0))
+    labels[near] = grown
+    return np.asarray(labels)
 
 
 def _features(
-    component: Component, maps: MotionMaps, cues: EvidenceCues, outline: BoolArray, shape: Shape
+    component: Component, box: BoundingBox, maps: MotionMaps, cues: EvidenceCues, outline: BoolArray, shape: Shape
 ) -> Float64Array:
     """[13], in the order of ``REGION_FEATURES``."""
     y, x = component
@@ -167,7 +188,10 @@ def _features(
     at, blocks = (y[some], x[some]), (y[some] // EVIDENCE_BLOCK_PX, x[some] // EVIDENCE_BLOCK_PX)
     means = np.abs(cues.geometric[_CUES, blocks[0][:, None], blocks[1][:, None]]).mean(axis=0)
     shares = (np.log(y.size / maps.motion.size), y.size / outline.size, min(shape.nearness_to_band, 2.0))
-    mean, largest = float(maps.motion[at].mean()), float(maps.motion[y, x].max())
+    mean, (_, largest, _, _) = (
+        float(maps.motion[at].mean()),
+        cv2.minMaxLoc(maps.motion[box.pixels], outline.view(np.uint8)),
+    )
     own = (_logit(mean), _logit(largest), *shares, sigmoid(maps.seam_logit[at]).mean())
     return np.array([*own, *means], dtype=np.float64)
 

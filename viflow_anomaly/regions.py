@@ -12,7 +12,7 @@ large and the same labels.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -25,6 +25,7 @@ from viflow_anomaly.shape_rule import ShapeLimits, judge_shape, thickness_px
 
 BoolArray = NDArray[np.bool_]
 IndexArray = NDArray[np.intp]
+LabelArray = NDArray[np.integer[Any]]
 RegionLabel = Literal["independent_motion", "model_error"]
 
 MAD_TO_SIGMA = 1.4826
@@ -45,6 +46,11 @@ class BoundingBox(NamedTuple):
     def middle_px(self) -> tuple[float, float]:
         """(u, v); pixel centres lie at integers."""
         return self.x + (self.width - 1) / 2, self.y + (self.height - 1) / 2
+
+    @property
+    def pixels(self) -> tuple[slice, slice]:
+        """Rows and columns of an array [H, W]."""
+        return slice(self.y, self.y + self.height), slice(self.x, self.x + self.width)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,12 +188,13 @@ def shape_limits(config: RegionConfig, diagonal_px: float) -> ShapeLimits:
 
 def pixels_of(mask: BoolArray) -> tuple[IndexArray, IndexArray]:
     """Rows y [n] and columns x [n] of a mask's pixels, row-major."""
-    y, x = np.divmod(np.flatnonzero(mask), mask.shape[1])  # np.nonzero takes five times as long
-    return y, x
+    at = np.flatnonzero(mask)  # np.nonzero takes five times as long
+    y = at // mask.shape[1]
+    return y, at - y * mask.shape[1]
 
 
 def largest_components(
-    y: IndexArray, x: IndexArray, labels: IndexArray, image_px: int, config: RegionConfig
+    y: IndexArray, x: IndexArray, labels: LabelArray, image_px: int, config: RegionConfig
 ) -> list[Component]:
     """Components of at least the minimum area, at most ``max_regions`` (the largest), largest first.
 
@@ -196,7 +203,7 @@ def largest_components(
 
     Args:
         y, x: of the mask's pixels, row-major.
-        labels: of each, from 1 on; 0 belongs to none.
+        labels: of each, integers from 1 on; 0 belongs to none.
         image_px: pixels of the image.
         config: limits.
     """

@@ -98,8 +98,10 @@ def compensate_exposure(reconstruction: Float32Array, source: Uint8Array, inside
         bias = middle_y - gain * middle_x
     if not 1 / MAX_GAIN <= gain <= MAX_GAIN:
         return reconstruction
-    compensated = reconstruction * np.float32(gain) + np.float32(bias)
-    return np.asarray(np.where(inside, compensated, reconstruction), dtype=np.float32)
+    compensated = reconstruction * np.float32(gain)
+    compensated += np.float32(bias)
+    np.copyto(compensated, reconstruction, where=~inside)
+    return compensated
 
 
 def half_range_gray(source: Uint8Array) -> Float32Array:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from viflow_anomaly import detector as detector_module
 from viflow_anomaly.checkpoint import load_evidence_head, save_evidence_head
 from viflow_anomaly.checkpoint_record import EvidenceRecord, bundled_checkpoint
 from viflow_anomaly.cli.pair_files import PairFiles, load_pair
@@ -123,6 +125,22 @@ def test_a_damaged_head_abstains(tmp_path: Path) -> None:
         detection = AnomalyDetector.from_checkpoint(evidence_head=path).detect(sample_pair())
         assert (detection.status, detection.reasons[-1].code) == ("abstained", "prediction_not_finite")
         assert "evidence head" in detection.reasons[-1].message
+
+
+def test_the_head_does_not_look_at_a_pair_that_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+    detector, pair = AnomalyDetector.from_checkpoint(), sample_pair()
+    flat = replace(pair, source=replace(pair.source, image=np.full_like(pair.source.image, 90)))
+    looked_at: list[int] = []
+    judge = detector_module.judge_cues
+    monkeypatch.setattr(detector_module, "judge_cues", lambda *given: looked_at.append(1) or judge(*given))
+    judged, refused = detector.analyze(pair), detector.analyze(flat)
+    assert looked_at == [1]
+    assert (judged.detection.status, refused.detection.status) == ("ok", "abstained")
+    assert judged.learned
+    assert refused.learned
+    assert judged.evidence.max() > 0.5
+    assert not refused.evidence.any()
+    assert refused.residual.any()
 
 
 def test_scores_of_other_measures_are_refused(tmp_path: Path) -> None:

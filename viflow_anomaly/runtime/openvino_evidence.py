@@ -11,6 +11,15 @@ from viflow_anomaly.config import EVIDENCE_BLOCK_PX, Precision
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.runtime.exported import HEAD_KEY
 from viflow_anomaly.runtime.interface import HeadAnswer
+from viflow_anomaly.runtime.openvino_blocks import (
+    CUES,
+    LOGITS,
+    PIXELS,
+    QUAD_VALUES,
+    by_blocks,
+    read_logit_blocks,
+    write_cue_blocks,
+)
 from viflow_anomaly.runtime.openvino_network import OpenvinoNetwork, Size
 
 
@@ -22,16 +31,23 @@ class OpenvinoEvidence:
 
         def shapes(size: Size) -> dict[str, list[int]]:
             blocks = [side // EVIDENCE_BLOCK_PX for side in size]
-            return {"photometric": [1, counts[0], *size], "geometric": [1, counts[1], *blocks]}
+            cues = {"photometric": [1, counts[0], *size], "geometric": [1, counts[1], *blocks]}
+            return {**cues, CUES: [1, *blocks, -(-(counts[0] * PIXELS + counts[1]) // QUAD_VALUES) * QUAD_VALUES]}
 
-        self._network = OpenvinoNetwork(path, record, shapes=shapes, threads=threads, precision=precision)
+        self._network = OpenvinoNetwork(
+            path, record, shapes=shapes, adapt=by_blocks, threads=threads, precision=precision
+        )
         if HEAD_KEY not in self._network.metadata:
             raise corrupt_checkpoint(path, "expected the export of an evidence head, found another network's")
 
     def judge(self, photometric: Float32Array, geometric: Float32Array) -> HeadAnswer:
         height, width = photometric.shape[1:]
         request, inputs, outputs = self._network.request((height, width))
-        np.copyto(inputs["photometric"][0], photometric)
-        np.copyto(inputs["geometric"][0], geometric)
+        if CUES in inputs:
+            write_cue_blocks(photometric, geometric, inputs[CUES][0])
+        else:
+            np.copyto(inputs["photometric"][0], photometric)
+            np.copyto(inputs["geometric"][0], geometric)
         request.infer()
-        return HeadAnswer(*(np.array(outputs[name][0], dtype=np.float32) for name in HeadAnswer._fields))
+        logits = read_logit_blocks(outputs[LOGITS][0]) if LOGITS in outputs else np.array(outputs["logits"][0])
+        return HeadAnswer(np.asarray(logits, dtype=np.float32), np.array(outputs["offsets"][0], dtype=np.float32))

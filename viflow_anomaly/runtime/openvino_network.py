@@ -44,12 +44,14 @@ class Request(NamedTuple):
 
     @classmethod
     def of(cls, compiled: Any) -> Self:
-        """A new request; its shapes are fixed, so its buffers stay where they are."""
+        """A new request; its shapes are fixed, so its buffers stay where they are. Inputs begin as zeros."""
         request = compiled.create_infer_request()
         inputs, outputs = (
             {port.get_any_name(): request.get_tensor(port).data for port in ports}
             for ports in (compiled.inputs, compiled.outputs)
         )
+        for values in inputs.values():
+            values.fill(0)
         return cls(request, inputs, outputs)
 
 
@@ -59,7 +61,9 @@ class OpenvinoNetwork:
     Args:
         path: of the exported network.
         record: of the checkpoint that it must have been exported from.
-        shapes: of the inputs that depend on the size (height, width) of what is seen.
+        shapes: of the inputs that depend on the size (height, width) of what is seen; those that the network has
+            not are passed over.
+        adapt: changes the network that was read before it is compiled.
         threads: of one prediction.
         precision: "auto" computes in bfloat16 where the CPU has it.
 
@@ -73,6 +77,7 @@ class OpenvinoNetwork:
         record: TensorRecord,
         *,
         shapes: Callable[[Size], dict[str, list[int]]],
+        adapt: Callable[[Any], None] | None = None,
         threads: int,
         precision: Precision = "f32",
     ) -> None:
@@ -87,6 +92,7 @@ class OpenvinoNetwork:
             ) from err
         self._data = data
         self._shapes = shapes
+        self._adapt = adapt
         self._threads = threads
         has_bfloat16 = "BF16" in self._core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
         self._precision = "bf16" if precision == "auto" and has_bfloat16 else "f32"
@@ -109,7 +115,10 @@ class OpenvinoNetwork:
             compiled = self._compiled.get(size)
             if compiled is None:
                 model = self._core.read_model(self._data)
-                model.reshape(self._shapes(size))
+                if self._adapt is not None:
+                    self._adapt(model)
+                names = {port.get_any_name() for port in model.inputs}
+                model.reshape({name: shape for name, shape in self._shapes(size).items() if name in names})
                 compiled = self._core.compile_model(
                     model,
                     "CPU",
