@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import cv2
@@ -89,16 +89,25 @@ class InternalView:
             [H, W, 2] float32 (u, v).
         """
         if self.lens is not None:
-            spread = self.lens.spread(flow_view_px, stride)
+            coordinates = self.lens.spread(flow_view_px, stride)
         else:
             scales = [1 / (step * stride) for step in self.step_px]
             offsets = [
                 (middle + 0.5) / stride - 0.5 - center * scale
                 for center, middle, scale in zip(self.center_px, self.middle_px, scales, strict=True)
             ]
-            flow = flow_view_px * np.array(self.step_px, dtype=np.float32)
-            spread = _sample_affine(flow, scales, offsets, (self.source_width, self.source_height))
-        return np.asarray(cv2.add(spread, cached_pixel_grid(self.source_height, self.source_width)), dtype=np.float32)
+            along_x, along_y = (
+                _bilinear_weights(cells, scale, offset, side)
+                for cells, scale, offset, side in zip(
+                    flow_view_px.shape[1::-1], scales, offsets, (self.source_width, self.source_height), strict=True
+                )
+            )
+            wide = np.empty((len(flow_view_px), self.source_width, 2), dtype=np.float32)
+            for axis, step in enumerate(self.step_px):
+                wide[..., axis] = (flow_view_px[..., axis] * np.float32(step)) @ along_x.T
+            coordinates = (along_y @ wide.reshape(len(wide), -1)).reshape(self.source_height, self.source_width, 2)
+        coordinates += cached_pixel_grid(self.source_height, self.source_width)
+        return coordinates
 
     def sample_blocks(self, cells: Float32Array, stride: int, block_px: int) -> Float32Array:
         """What cells of the view (as in ``target_coordinates``) say of the middle of each block of source pixels.
@@ -172,6 +181,22 @@ def _sample_affine(
     matrix = np.array([[scales[0], 0.0, offsets[0]], [0.0, scales[1], offsets[1]]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpAffine(array, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+
+
+@lru_cache(maxsize=16)
+def _bilinear_weights(cells: int, scale: float, offset: float, side: int) -> Float32Array:
+    """[side, cells]: how every pixel, at pixel * scale + offset, is made of two cells; beyond the last ones, of those.
+
+    For a few cells, two products with such matrices take a third of the time of OpenCV's warp, which for two channels
+    also rounds places to 1/32 of a cell.
+    """
+    at = np.clip(np.arange(side) * scale + offset, 0, cells - 1)
+    first = np.minimum(at.astype(np.intp), max(cells - 2, 0))
+    weights = np.zeros((side, cells), dtype=np.float32)
+    weights[np.arange(side), first] = 1 - (at - first)
+    weights[np.arange(side), np.minimum(first + 1, cells - 1)] += at - first
+    weights.setflags(write=False)
+    return weights
 
 
 # An image of the largest size that the default limits allow (16 Mi pixels) fits into it.
