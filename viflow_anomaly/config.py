@@ -249,7 +249,7 @@ Precision = Literal["auto", "f32", "bf16", "int8"]
 """What a network is computed in. "auto": float32 on a CPU, but for the evidence head in OpenVINO, which takes bfloat16
 where the CPU computes in it; bfloat16 in torch on CUDA. "int8" takes an export of ``export --int8``."""
 NetworkPrecision = Literal["auto", "f32", "bf16"]
-"""The network's own; int8 is no faster there than bfloat16 and costs regions, docs/runtimes.md has the numbers."""
+"""The network's own; int8 is hardly faster there than bfloat16 and may cost regions, see docs/runtimes.md."""
 RuntimeName = Literal["auto", "torch", "openvino", "onnxruntime"]
 """What runs the networks: "auto" is OpenVINO, else ONNX Runtime, on a CPU where it is installed and the checkpoint was
 exported, else torch."""

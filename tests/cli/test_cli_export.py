@@ -43,7 +43,12 @@ def test_a_head_alone_needs_no_network(ask: Ask, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "words"), [(["--int8"], "--evidence-head PATH"), (["--calibration", "DIR"], "--calibration alone")]
+    ("options", "words"),
+    [
+        (["--int8", "--format", "openvino"], "--evidence-head PATH and --format openvino"),
+        (["--int8", "--evidence-head", "h.safetensors"], "--evidence-head PATH and --format openvino"),
+        (["--calibration", "DIR"], "--calibration alone"),
+    ],
 )
 def test_options_that_need_each_other(ask: Ask, options: list[str], words: str) -> None:
     answer = ask(["export", *options])
@@ -66,6 +71,8 @@ def test_an_int8_head_is_calibrated_on_the_recording_that_is_named(ask: Ask, tmp
         shutil.copy(bundled_evidence_head().with_suffix(suffix), tmp_path / f"h{suffix}")
     head = tmp_path / "h.safetensors"
     sample = Path(__file__).parents[2] / "samples" / "drone"
-    answer = ask(["export", "--evidence-head", str(head), "--int8", "--calibration", str(sample)])
-    assert (answer.code, answer.out.strip(), answer.err) == (0, str(tmp_path / "h.int8.onnx"), "")
-    assert load_evidence(head, runtime="onnxruntime", precision="int8").runtime.backend.precision == "int8"
+    answer = ask(
+        ["export", "--evidence-head", str(head), "--int8", "--format", "openvino", "--calibration", str(sample)]
+    )
+    assert (answer.code, answer.out.strip(), answer.err) == (0, str(tmp_path / "h.int8.xml"), "")
+    assert load_evidence(head, precision="int8").runtime.backend.precision == "int8"

@@ -39,7 +39,7 @@ def export(
         Format, typer.Option("--format", help="ONNX, or OpenVINO's .xml with its weights in a .bin.")
     ] = Format.onnx,
     int8: Annotated[
-        bool, typer.Option("--int8", help="Convolutions in int8 (for precision=int8; needs the extra `int8`).")
+        bool, typer.Option("--int8", help="An evidence head for precision=int8 (needs the extra `int8`).")
     ] = False,
     calibration: Annotated[
         list[Path] | None,
@@ -72,10 +72,10 @@ def export(
             "--evidence-head exports the head alone, which needs no network but for --int8: expected one of "
             "--checkpoint and --evidence-head, found both"
         )
-    if int8 and evidence_head is None:
+    if int8 and (evidence_head is None or layout is not Format.openvino):
         raise typer.BadParameter(
-            "--int8 is for evidence heads: expected --evidence-head PATH, found none (for the network it is no faster "
-            "than bf16 and costs regions, see docs/runtimes.md)"
+            "--int8 is for evidence heads in OpenVINO: expected --evidence-head PATH and --format openvino with it "
+            "(elsewhere it costs more than it gains, see docs/runtimes.md)"
         )
     if calibration and not int8:
         raise typer.BadParameter("--calibration is for --int8: expected both, found --calibration alone")

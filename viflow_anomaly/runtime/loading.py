@@ -149,6 +149,11 @@ def _problem(runtime: RuntimeName, path: Path, wish: _Wish) -> ConfigError | Non
     """Why a runtime cannot do as it is asked; None: nothing is known against it."""
     if runtime == "torch":
         return _no_precision("torch", wish, "f32", "bf16")
+    return _not_installed(runtime, wish) or _nothing_to_run(runtime, path, wish)
+
+
+def _not_installed(runtime: RuntimeName, wish: _Wish) -> ConfigError | None:
+    """Or it knows neither the device nor the precision."""
     if find_spec(runtime) is None:
         package = {"openvino": "OpenVINO", "onnxruntime": "ONNX Runtime"}[runtime]
         return _missing(
@@ -157,10 +162,16 @@ def _problem(runtime: RuntimeName, path: Path, wish: _Wish) -> ConfigError | Non
     if runtime == "openvino" and wish.device != "cpu":
         return _missing(f"expected the device 'cpu' for OpenVINO, found {wish.device!r}")
     if runtime == "onnxruntime" and wish.precision == "bf16":
-        return _no_precision("onnxruntime", wish, "f32", "int8")
+        return _no_precision("onnxruntime", wish, "f32")
+    return None
+
+
+def _nothing_to_run(runtime: RuntimeName, path: Path, wish: _Wish) -> ConfigError | None:
     suffix = _openvinos(path, wish.precision) if runtime == "openvino" else _onnx(wish.precision)
     export = export_path(path, suffix)
     if not export.exists():
+        if suffix == ".int8.onnx":  # which the command line does not write
+            return _no_precision("onnxruntime", wish, "f32")
         command = export_command(path, export, of_head=wish.of_head)
         return _missing(f"expected {export} ({command} writes it), found no such file")
     return None
