@@ -60,6 +60,7 @@ def load_bundled_or_configured(settings: ServiceSettings) -> PairDetector:
         threads=settings.threads,
         evidence_head=settings.evidence_head,
         precision=settings.precision,
+        network_precision=settings.network_precision,
     )
     return calibrated(detector, settings.calibration)
 

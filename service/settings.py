@@ -13,6 +13,7 @@ from viflow_anomaly.config import (
     MAX_THREADS,
     DetectorConfig,
     ImageLimits,
+    NetworkPrecision,
     Precision,
     RuntimeName,
     UsablePath,
@@ -41,11 +42,14 @@ class ServiceSettings(BaseSettings):
     checkpoint: UsablePath | None = Field(default=None, description="model to load; the bundled one when not given")
     evidence_head: UsablePath | None = Field(default=None, description="head to load; the bundled one when not given")
     precision: Precision = Field(
-        default="auto", description="of the evidence head: f32, or auto: bfloat16 where it can"
+        default="auto", description="of the evidence head: f32, bf16, int8, or auto: bf16 where OpenVINO can"
     )
+    network_precision: NetworkPrecision = Field(default="auto", description="of the network: f32 (auto on a CPU), bf16")
     calibration: UsablePath | None = Field(default=None, description="file of `viflow-anomaly calibrate`")
     device: str = "cpu"
-    runtime: RuntimeName = Field(default="auto", description="torch, openvino, or auto: OpenVINO where it can run")
+    runtime: RuntimeName = Field(
+        default="auto", description="openvino, onnxruntime, torch, or auto: the first that can run"
+    )
     detector: DetectorConfig = DetectorConfig()
     host: str = "127.0.0.1"
     port: int = Field(default=8000, ge=0, le=65535, description="0 takes a free one, named in the log")

@@ -19,6 +19,7 @@ from viflow_anomaly.detection import (
     rois_from_regions,
 )
 from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.pair_detector import Backend, Execution
 from viflow_anomaly.prediction import PredictedFlow
 from viflow_anomaly.regions import find_regions
 from viflow_anomaly.sensor_data import FramePair
@@ -39,6 +40,7 @@ class DifferenceDetector:
     on_pair: Callable[[FramePair], None] = lambda pair: None
     seen: list[int] = field(default_factory=list)
     motor_source: MotorSource | None = None
+    execution: Execution = field(default_factory=lambda: Execution(Backend("rule", "cpu", "f32"), None))
 
     def with_config(self, config: DetectorConfig) -> DifferenceDetector:
         return replace(self, config=config)

@@ -24,6 +24,7 @@ from viflow_anomaly.alarm_footage import JudgedPair, WatchedRecording, footage_o
 from viflow_anomaly.config import DetectorConfig
 from viflow_anomaly.detection import ModelInfo
 from viflow_anomaly.errors import ConfigError
+from viflow_anomaly.pair_detector import Backend, Execution
 
 CALM = (JudgedPair(0.5, ()),)
 HALL = WatchedRecording(
@@ -41,6 +42,7 @@ def made(**changes: Any) -> AlarmCalibration:
     watched = [HALL, YARD]
     what: dict[str, Any] = {
         "model": ModelInfo("difference", "1", "ab" * 32),
+        "execution": Execution(Backend("rule", "cpu", "f32"), None),
         "detector": DetectorConfig(),
         "budget_per_hour": 30.0,
         "confidence": 0.95,
@@ -114,6 +116,31 @@ def test_other_weights_are_refused(path: Path) -> None:
         calibrated(detector, path)
     assert (caught.value.code, caught.value.field) == ("calibration_stale", "calibration")
     assert str(path) in caught.value.message
+
+
+@pytest.mark.parametrize(
+    ("execution", "words"),
+    [
+        (Execution(Backend("torch", "cpu", "f32"), None), "execution.network.runtime rule, found torch"),
+        (Execution(Backend("rule", "cuda", "f32"), None), "execution.network.device cpu, found cuda"),
+        (Execution(Backend("rule", "cpu", "bf16"), None), "execution.network.precision f32, found bf16"),
+        (Execution(*[Backend("rule", "cpu", "f32")] * 2), "execution.evidence None, found nothing"),
+    ],
+)
+def test_scores_that_were_computed_otherwise_are_refused(path: Path, execution: Execution, words: str) -> None:
+    with pytest.raises(ConfigError, match=words) as caught:
+        calibrated(DifferenceDetector(execution=execution), path)
+    assert caught.value.code == "calibration_stale"
+
+
+def test_a_file_from_before_that_was_recorded_is_refused(path: Path) -> None:
+    values = json.loads(path.read_text())
+    del values["execution"]
+    path.write_text(json.dumps(values))
+    assert read_calibration(path).execution == {}
+    with pytest.raises(ConfigError, match="found rule") as caught:
+        calibrated(DifferenceDetector(), path)
+    assert caught.value.code == "calibration_stale"
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from viflow_anomaly.config import DetectorConfig, RegionConfig, RigEstimateConfi
 from viflow_anomaly.datasets.recording import FileRecording
 from viflow_anomaly.detection import ModelInfo, load_detection_schema
 from viflow_anomaly.errors import DatasetError, InvalidInputError, ViflowError
+from viflow_anomaly.pair_detector import Backend, Execution
 from viflow_anomaly.sensor_data import FramePair
 
 FRAMES = 6
@@ -113,7 +114,19 @@ def test_run_json_records_what_decided_the_results(recording: FileRecording, out
     assert run["model"] == {"name": "difference", "version": "1", "sha256": "ab" * 32}
     assert run["recording"]["frames"] == FRAMES
     assert run["recording"]["camera"]["fx"] == 80.0
-    assert set(run["versions"]) == {"viflow-anomaly", "torch", "numpy", "opencv-python-headless", "scikit-image"}
+    assert set(run["versions"]) == {
+        "viflow-anomaly",
+        "torch",
+        "openvino",
+        "onnxruntime",
+        "numpy",
+        "opencv-python-headless",
+        "scikit-image",
+    }
+    assert run["execution"] == {
+        "network": {"runtime": "rule", "device": "cpu", "precision": "f32"},
+        "evidence": None,
+    }
     assert run["wall_time_s"] >= 0
 
 
@@ -317,6 +330,11 @@ def test_resume_adds_pictures_to_finished_detections(recording: FileRecording, o
             DifferenceDetector(config=DetectorConfig(regions=RegionConfig(max_regions=3))),
             {},
             "configuration.detector.regions.max_regions",
+        ),
+        (
+            DifferenceDetector(execution=Execution(Backend("rule", "cpu", "bf16"), None)),
+            {},
+            "execution.network.precision",
         ),
         (DifferenceDetector(), {"look_ahead": 2}, "options.look_ahead"),
         (DifferenceDetector(), {"tracking": None}, "options.tracking"),

@@ -48,7 +48,7 @@ from viflow_anomaly.motor_input import (
     require_supported,
 )
 from viflow_anomaly.prediction import correct, view_rays
-from viflow_anomaly.runtime.export import export_onnx
+from viflow_anomaly.runtime.export import export_network
 from viflow_anomaly.runtime.interface import Hypotheses
 from viflow_anomaly.runtime.loading import load_runtime
 from viflow_anomaly.sensor_data import FramePair
@@ -467,7 +467,7 @@ def test_openvino_takes_the_motor_stream(tmp_path: Path, inputs: MotionInputs) -
     pytest.importorskip("onnxscript", reason="the extra 'export' is not installed")
     model = config(inputs, preset="compact")
     path = save_checkpoint(tmp_path / "m.safetensors", build_model(model, seed=1), model, name="m", version="1")
-    export_onnx(path)
+    export_network(path)
     one = prepare(pair_with(tmp_path / "pair", [0, 0, 2.0]), model)
     flows = [load_runtime(path, runtime=name).runtime.predict(one).flow_px for name in ("torch", "openvino")]
     np.testing.assert_allclose(flows[1], flows[0], atol=1e-3)

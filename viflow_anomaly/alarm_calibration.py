@@ -24,7 +24,7 @@ from viflow_anomaly.checkpoint_record import source_commit, write_atomically
 from viflow_anomaly.config import DetectorConfig, FrozenConfig
 from viflow_anomaly.detection import ModelInfo
 from viflow_anomaly.errors import ConfigError
-from viflow_anomaly.pair_detector import PairDetector
+from viflow_anomaly.pair_detector import Execution, PairDetector
 
 SCHEMA_VERSION = "1.0"
 MAX_FILE_BYTES = 4 * 1024 * 1024
@@ -65,6 +65,7 @@ class AlarmCalibration(FrozenConfig):
             ``ThresholdChoice``.
         hours, pairs: judged; ``abstained`` and ``failed`` pairs are in neither.
         regions: labelled as motion at the lowest threshold.
+        execution: what computed network and evidence head, on what, in which precision; empty in older files.
         detector: the configuration that the scores depend on; ``detector_sha256``: its digest.
         package_version: of viflow-anomaly.
         commit: of its source tree, where it ran from one.
@@ -90,6 +91,7 @@ class AlarmCalibration(FrozenConfig):
     alarm_blocks: NonNegativeInt
     clump: float = Field(ge=1)
     model: CalibratedModel
+    execution: dict[str, dict[str, str] | None] = Field(default_factory=dict)
     detector: dict[str, Any]
     detector_sha256: str = Field(pattern="^[0-9a-f]{64}$")
     package_version: str
@@ -109,6 +111,7 @@ def make_calibration(
     footage: ScoredFootage,
     *,
     model: ModelInfo,
+    execution: Execution,
     detector: DetectorConfig,
     budget_per_hour: float,
     confidence: float,
@@ -119,7 +122,7 @@ def make_calibration(
     Args:
         watched: what the recordings gave.
         footage: its scores in blocks of ``block_s``.
-        model, detector: whose scores they are.
+        model, execution, detector: whose scores they are.
         budget_per_hour, confidence: as ``choose_threshold``.
     """
     choice = choose_threshold(footage, budget_per_hour=budget_per_hour, confidence=confidence)
@@ -138,6 +141,7 @@ def make_calibration(
         blocks=footage.block_hours.size,
         block_s=block_s,
         model=CalibratedModel.model_validate(asdict(model)),
+        execution=execution.as_mapping(),
         detector=configuration,
         detector_sha256=digest(configuration),
         package_version=version("viflow-anomaly"),
@@ -184,8 +188,8 @@ def calibrated(detector: AnyDetector, path: Path | None) -> AnyDetector:
     """The detector with the threshold of the file; None: the detector as it is.
 
     Raises:
-        ConfigError: ``calibration_stale``: made with other weights, another configuration or version; as
-            ``read_calibration``.
+        ConfigError: ``calibration_stale``: made with other weights, runtime, precision, configuration or version;
+            as ``read_calibration``.
     """
     if path is None:
         return detector
@@ -204,12 +208,14 @@ def require_current(calibration: AlarmCalibration, detector: PairDetector, *, wh
     made_with = {
         "model.sha256": calibration.model.sha256,
         "model.version": calibration.model.version,
+        **flattened("execution", calibration.execution),
         **flattened("detector", calibration.detector),
         "viflow-anomaly": calibration.package_version,
     }
     now = {
         "model.sha256": detector.model_info.sha256,
         "model.version": detector.model_info.version,
+        **flattened("execution", detector.execution.as_mapping()),
         **flattened("detector", what_scores_depend_on(detector.config)),
         "viflow-anomaly": version("viflow-anomaly"),
     }

@@ -111,7 +111,12 @@ def run_batch(
             code="recording_too_short",
         )
     run = describe_run(
-        recording, model=detector.model_info, detector=detector.config, options=options, settings=settings or {}
+        recording,
+        model=detector.model_info,
+        execution=detector.execution,
+        detector=detector.config,
+        options=options,
+        settings=settings or {},
     )
     _prepare(options, run)
     with Journal(options.out_dir / JOURNAL_NAME) as journal:

@@ -16,11 +16,13 @@ from viflow_anomaly.datasets.camera_json import camera_to_mapping
 from viflow_anomaly.datasets.recording import Recording
 from viflow_anomaly.detection import ModelInfo
 from viflow_anomaly.errors import InvalidInputError
+from viflow_anomaly.pair_detector import Execution
 
 # What a resumed run must have in common with the run it goes on with.
 _DECISIVE = (
     "model.sha256",
     "model.version",  # names the evidence head, too
+    "execution",
     "configuration.detector",
     "options.look_ahead",
     "options.tracking",
@@ -28,7 +30,15 @@ _DECISIVE = (
     "recording.camera",
     "versions.viflow-anomaly",
 )
-_VERSIONED_PACKAGES = ("viflow-anomaly", "torch", "numpy", "opencv-python-headless", "scikit-image")
+_VERSIONED_PACKAGES = (
+    "viflow-anomaly",
+    "torch",
+    "openvino",
+    "onnxruntime",
+    "numpy",
+    "opencv-python-headless",
+    "scikit-image",
+)
 
 
 @dataclass(frozen=True)
@@ -89,6 +99,7 @@ def describe_run(
     recording: Recording,
     *,
     model: ModelInfo,
+    execution: Execution,
     detector: DetectorConfig,
     options: FrozenConfig,
     settings: Mapping[str, Any],
@@ -106,6 +117,7 @@ def describe_run(
         "configuration": {**settings, "detector": detector.model_dump(mode="json")},
         "options": options.model_dump(mode="json", exclude={"out_dir", "resume", "overwrite"}),
         "model": asdict(model),
+        "execution": execution.as_mapping(),
         "versions": {name: _version(name) for name in _VERSIONED_PACKAGES},
     }
     return dict(json.loads(json.dumps(run)))

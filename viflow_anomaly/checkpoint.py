@@ -15,6 +15,7 @@ from safetensors.torch import save as save_tensors
 from torch import nn
 
 from viflow_anomaly.checkpoint_record import (
+    EXPORT_SUFFIXES,
     CheckpointRecord,
     EvidenceRecord,
     TensorRecord,
@@ -67,7 +68,9 @@ def save_evidence_head(path: Path, head: nn.Module, record: EvidenceRecord) -> P
     """Write an evidence head: ``path`` (.safetensors) and its JSON; the record's checksum is filled in."""
     data = _tensor_bytes(head)
     sha256 = hashlib.sha256(data).hexdigest()
-    return _write_checkpoint(path, data, record.model_copy(update={"sha256": sha256, "onnx_sha256": None}))
+    return _write_checkpoint(
+        path, data, record.model_copy(update={"sha256": sha256, "onnx_sha256": None, "exports": {}})
+    )
 
 
 def _tensor_bytes(network: nn.Module) -> bytes:
@@ -76,7 +79,8 @@ def _tensor_bytes(network: nn.Module) -> bytes:
 
 
 def _write_checkpoint(path: Path, data: bytes, record: TensorRecord) -> Path:
-    path.with_suffix(".onnx").unlink(missing_ok=True)  # an export of what was here before
+    for suffix in (*EXPORT_SUFFIXES, ".bin", ".int8.bin"):  # exports of what was here before
+        path.with_suffix(suffix).unlink(missing_ok=True)
     write_atomically(path, data)
     write_record(path, record)
     return path

@@ -9,7 +9,7 @@ import os
 import subprocess
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
 from pydantic import Field, model_validator
 
@@ -17,6 +17,10 @@ from viflow_anomaly.config import EvidenceHeadConfig, FrozenConfig, ModelConfig,
 from viflow_anomaly.errors import CheckpointError, ConfigError
 
 FORMAT_VERSION = 1
+ExportSuffix = Literal[".onnx", ".int8.onnx", ".xml", ".int8.xml"]
+EXPORT_SUFFIXES: tuple[ExportSuffix, ...] = get_args(ExportSuffix)
+"""What an export beside NAME.safetensors is called: NAME.onnx, ...; the weights of NAME.xml are in NAME.bin."""
+Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 BUNDLED_NAME = "viflow-calibrated"
 BUNDLED_EVIDENCE_NAME = "viflow-evidence"
 MAX_RECORD_BYTES = 4 * 1024 * 1024
@@ -29,16 +33,28 @@ class TensorRecord(FrozenConfig):
         format_version: of this layout; another one is refused.
         name, version: of the network.
         sha256: of the tensor file.
-        onnx_sha256: of the export beside it, None until there is one.
+        onnx_sha256: of NAME.onnx beside it, None until there is one.
+        exports: of its other exports, by suffix; of two files, the .xml and behind it the .bin.
         provenance: commit, training configuration, data, metrics; free-form, for people.
     """
 
     format_version: Literal[1] = 1
     name: str = Field(min_length=1)
     version: str = Field(min_length=1)
-    sha256: str = Field(pattern="^[0-9a-f]{64}$")
-    onnx_sha256: str | None = Field(default=None, pattern="^[0-9a-f]{64}$")
+    sha256: Sha256
+    onnx_sha256: Sha256 | None = None
+    exports: dict[ExportSuffix, Sha256] = Field(default_factory=dict, exclude_if=lambda exports: not exports)
     provenance: dict[str, Any] = Field(default_factory=dict)
+
+    def export_sha256(self, suffix: ExportSuffix) -> str | None:
+        """The checksum of one export; None where there is none."""
+        return self.onnx_sha256 if suffix == ".onnx" else self.exports.get(suffix)
+
+    def with_export(self, suffix: ExportSuffix, sha256: str) -> Self:
+        """The record of a checkpoint that was exported."""
+        if suffix == ".onnx":
+            return self.model_copy(update={"onnx_sha256": sha256})
+        return self.model_copy(update={"exports": {**self.exports, suffix: sha256}})
 
 
 class CheckpointRecord(TensorRecord):

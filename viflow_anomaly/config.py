@@ -248,10 +248,14 @@ class RegionConfig(FrozenConfig):
 
 
 MAX_THREADS = 1024
-Precision = Literal["auto", "f32"]
-"""Of the evidence head in OpenVINO: "auto" is bfloat16 on CPUs that compute in it."""
-RuntimeName = Literal["auto", "torch", "openvino"]
-"""What runs the network: "auto" is OpenVINO on a CPU where it is installed and the checkpoint was exported."""
+Precision = Literal["auto", "f32", "bf16", "int8"]
+"""What a network is computed in. "auto": float32 on a CPU, but for the evidence head in OpenVINO, which takes bfloat16
+where the CPU computes in it; bfloat16 in torch on CUDA. "int8" takes an export of ``export --int8``."""
+NetworkPrecision = Literal["auto", "f32", "bf16"]
+"""The network's own; int8 is hardly faster there than bfloat16 and may cost regions, see docs/runtimes.md."""
+RuntimeName = Literal["auto", "torch", "openvino", "onnxruntime"]
+"""What runs the networks: "auto" is OpenVINO, else ONNX Runtime, on a CPU where it is installed and the checkpoint was
+exported, else torch."""
 
 
 class CorrectionConfig(FrozenConfig):

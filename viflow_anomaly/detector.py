@@ -29,6 +29,7 @@ from viflow_anomaly.geometry import Float32Array, pixel_grid
 from viflow_anomaly.model_input import prepare
 from viflow_anomaly.motion_evidence import JudgedCues, judge_cues, regions_of, require_our_cues, takes_head
 from viflow_anomaly.motion_input import MotionWindow
+from viflow_anomaly.pair_detector import Execution
 from viflow_anomaly.pair_quality import Finding, judge_correction, judge_images, judge_window
 from viflow_anomaly.prediction import PredictedFlow, predict_flow
 from viflow_anomaly.runtime.interface import Runtime
@@ -135,24 +136,29 @@ class AnomalyDetector:
         evidence_head: Path | None = None,
         with_evidence: bool = True,
         precision: Precision = "auto",
+        network_precision: Precision = "auto",
     ) -> Self:
         """Load a checkpoint (None: the bundled model) and an evidence head.
 
         Args:
             path: a ``.safetensors`` file with its ``.json`` beside it.
             config: thresholds and shape rule.
-            device: torch device name; another one than "cpu" needs the torch runtime.
-            runtime: "auto" takes OpenVINO where it is installed and the checkpoint was exported, else torch.
-            threads: CPU threads of the network (torch: of the whole process); None: torch's own, one in OpenVINO.
+            device: "cpu", or a torch device name; ONNX Runtime knows "cuda" and "cuda:N", too.
+            runtime: "auto" takes OpenVINO, else ONNX Runtime, where it is installed and the checkpoint was exported,
+                else torch.
+            threads: CPU threads of the network (torch: of the whole process); None: torch's own, one elsewhere.
             evidence_head: a ``.safetensors`` file likewise; None: the bundled one.
             with_evidence: False: none is loaded, and regions are found in the residual.
-            precision: of the evidence head in OpenVINO; "f32" answers as torch does.
+            precision: of the evidence head; "f32" answers alike in all runtimes.
+            network_precision: likewise of the network.
 
         Raises:
             CheckpointError: as ``load_runtime``; ``evidence_cues_differ`` for a head of other cues than this version's.
-            ConfigError: ``device_unavailable``, ``runtime_unavailable``.
+            ConfigError: ``device_unavailable``, ``runtime_unavailable``, ``precision_unavailable``.
         """
-        loaded, record = load_runtime(path, runtime=runtime, device=device, threads=threads)
+        loaded, record = load_runtime(
+            path, runtime=runtime, device=device, threads=threads, precision=network_precision
+        )
         evidence = None
         if with_evidence:
             evidence = load_evidence(
@@ -163,8 +169,15 @@ class AnomalyDetector:
 
     @property
     def runtime(self) -> str:
-        """The backend that runs the network: ``torch`` or ``openvino``."""
-        return self._runtime.name
+        """What runs the network: ``torch``, ``openvino`` or ``onnxruntime``."""
+        return self._runtime.backend.runtime
+
+    @property
+    def execution(self) -> Execution:
+        """What runs the network, and the evidence head where one takes part."""
+        takes_part = self._evidence is not None and self.config.evidence != "residual"
+        evidence = self._evidence.runtime.backend if self._evidence is not None and takes_part else None
+        return Execution(self._runtime.backend, evidence)
 
     @property
     def motor_source(self) -> MotorSource | None:

@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Protocol, Self
+from typing import NamedTuple, Protocol, Self
 
 from viflow_anomaly.config import DetectorConfig, MotorSource
 from viflow_anomaly.detection import Detection, ModelInfo
 from viflow_anomaly.sensor_data import FramePair
 
 
+class Backend(NamedTuple):
+    """What one network is computed by, on and in: runtime and device by name; "f32", "bf16" or "int8"."""
+
+    runtime: str
+    device: str
+    precision: str
+
+
+class Execution(NamedTuple):
+    """How a detector computes; ``evidence`` is None where no evidence head takes part."""
+
+    network: Backend
+    evidence: Backend | None
+
+    def as_mapping(self) -> dict[str, dict[str, str] | None]:
+        """Plain JSON values."""
+        return {"network": self.network._asdict(), "evidence": self.evidence and self.evidence._asdict()}
+
+
 class DetectorIdentity(Protocol):
-    """Which weights, under which configuration, fed with what."""
+    """Which weights, under which configuration, fed with what, computed how."""
 
     @property
     def model_info(self) -> ModelInfo: ...
@@ -20,6 +39,9 @@ class DetectorIdentity(Protocol):
 
     @property
     def motor_source(self) -> MotorSource | None: ...
+
+    @property
+    def execution(self) -> Execution: ...
 
 
 class PairDetector(DetectorIdentity, Protocol):

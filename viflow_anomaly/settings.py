@@ -25,6 +25,7 @@ from viflow_anomaly.config import (
     FrozenConfig,
     ImageLimits,
     ModelConfig,
+    NetworkPrecision,
     Precision,
     RigEstimateConfig,
     RuntimeName,
@@ -64,6 +65,7 @@ class Settings(FrozenConfig):
     ``threads`` defaults to 1: one pair at a time is fastest that way wherever anything else runs on the machine,
     because idle OpenMP threads of a wider pool spin and take the cores from each other. ``calibration`` is a file of
     ``viflow-anomaly calibrate``; its threshold takes the place of ``detector.regions.motion_score``.
+    ``precision`` is the evidence head's, ``network_precision`` the network's.
     """
 
     checkpoint: UsablePath | None = None
@@ -73,6 +75,7 @@ class Settings(FrozenConfig):
     threads: int = Field(default=1, ge=1, le=MAX_THREADS)
     runtime: RuntimeName = "auto"
     precision: Precision = "auto"
+    network_precision: NetworkPrecision = "auto"
     limits: ImageLimits = ImageLimits()
     detector: DetectorConfig = DetectorConfig()
     tracking: TrackingConfig = TrackingConfig()

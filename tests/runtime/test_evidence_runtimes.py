@@ -20,7 +20,7 @@ from viflow_anomaly.errors import CheckpointError, ConfigError
 from viflow_anomaly.evidence_cues import CUES_VERSION, GEOMETRIC_CUES, PHOTOMETRIC_CUES
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.model.evidence_builder import build_evidence_head
-from viflow_anomaly.runtime.export import export_evidence_onnx, export_onnx
+from viflow_anomaly.runtime.export import export_head, export_network
 from viflow_anomaly.runtime.loading import load_evidence
 from viflow_anomaly.sensor_data import FramePair
 
@@ -55,7 +55,7 @@ def save(path: Path, **changes: object) -> Path:
 @pytest.fixture(scope="module")
 def head(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = save(tmp_path_factory.mktemp("head") / "head.safetensors")
-    assert export_evidence_onnx(path) == path.with_suffix(".onnx")
+    assert export_head(path) == path.with_suffix(".onnx")
     return path
 
 
@@ -152,7 +152,7 @@ def test_scores_of_other_measures_are_refused(tmp_path: Path) -> None:
 
 def test_another_networks_export_is_no_head(tmp_path: Path) -> None:
     path = save(tmp_path / "head.safetensors")
-    network = export_onnx(bundled_checkpoint(), tmp_path / "network.onnx")
+    network = export_network(bundled_checkpoint(), tmp_path / "network.onnx")
     path.with_suffix(".onnx").write_bytes(network.read_bytes())
     about = path.with_suffix(".json")
     values = json.loads(about.read_text()) | {"onnx_sha256": hashlib.sha256(network.read_bytes()).hexdigest()}

@@ -17,6 +17,7 @@ from viflow_anomaly.detection import (
     ResidualSummary,
     rois_from_regions,
 )
+from viflow_anomaly.pair_detector import Backend, Execution
 from viflow_anomaly.regions import find_regions
 from viflow_anomaly.sensor_data import FramePair
 
@@ -37,6 +38,7 @@ class RuleDetector:
         self.config = config or DetectorConfig()
         self.motor_source: MotorSource | None = None
         self.model_info = MODEL
+        self.execution = Execution(Backend("rule", "cpu", "f32"), None)
         self.may_go = may_go
         self.error = error
         self.calls = [] if calls is None else calls

@@ -230,6 +230,7 @@ def test_a_calibration_decides_what_is_labelled_as_motion(tmp_path: Path) -> Non
         watched,
         footage_of(watched),
         model=detector.model_info,
+        execution=detector.execution,
         detector=detector.config,
         budget_per_hour=1.0,
         confidence=0.9,

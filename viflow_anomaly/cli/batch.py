@@ -16,6 +16,7 @@ from viflow_anomaly.cli.options import (
     Checkpoint,
     ConfigFile,
     Device,
+    Runtime,
     Threads,
     load_detector,
     settings_from,
@@ -65,6 +66,7 @@ def batch(
     calibration: Calibration = None,
     threads: Threads = None,
     device: Device = None,
+    runtime: Runtime = None,
     config: ConfigFile = None,
     assignments: Assignments = None,
 ) -> int:
@@ -83,7 +85,7 @@ def batch(
     if resume and overwrite:
         raise typer.BadParameter("--resume keeps what --overwrite would replace; give one of them")
     options = {"checkpoint": checkpoint, "calibration": calibration, "threads": threads, "device": device}
-    settings = settings_from(config, assignments, {**options, "detector.include_masks": masks})
+    settings = settings_from(config, assignments, {**options, "runtime": runtime, "detector.include_masks": masks})
     from viflow_anomaly.batch_job import BatchOptions
     from viflow_anomaly.datasets.registry import open_recording
 

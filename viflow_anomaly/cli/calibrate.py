@@ -14,6 +14,7 @@ from viflow_anomaly.cli.options import (
     Checkpoint,
     ConfigFile,
     Device,
+    Runtime,
     Threads,
     load_detector,
     settings_from,
@@ -68,6 +69,7 @@ def calibrate(
     checkpoint: Checkpoint = None,
     threads: Threads = None,
     device: Device = None,
+    runtime: Runtime = None,
     config: ConfigFile = None,
     assignments: Assignments = None,
 ) -> None:
@@ -82,7 +84,7 @@ def calibrate(
 
       viflow-anomaly batch runs/patrol --calibration hall.json
     """
-    options = {"checkpoint": checkpoint, "threads": threads, "device": device}
+    options = {"checkpoint": checkpoint, "threads": threads, "device": device, "runtime": runtime}
     settings = settings_from(config, assignments, options)
     from viflow_anomaly.alarm_calibration import make_calibration, write_calibration
     from viflow_anomaly.alarm_footage import footage_of, watch_recordings
@@ -101,6 +103,7 @@ def calibrate(
         watched,
         footage_of(watched, block_s=block_seconds),
         model=detector.model_info,
+        execution=detector.execution,
         detector=detector.config,
         budget_per_hour=false_alarms_per_hour,
         confidence=confidence,

@@ -14,6 +14,7 @@ from viflow_anomaly.cli.options import (
     Checkpoint,
     ConfigFile,
     Device,
+    Runtime,
     Threads,
     load_detector,
     settings_from,
@@ -45,6 +46,7 @@ def detect(
     calibration: Calibration = None,
     threads: Threads = None,
     device: Device = None,
+    runtime: Runtime = None,
     config: ConfigFile = None,
     assignments: Assignments = None,
 ) -> None:
@@ -58,7 +60,7 @@ def detect(
       --source-timestamp-ns 1403715273262142976 --target-timestamp-ns 1403715273312143104
     """
     options = {"checkpoint": checkpoint, "calibration": calibration, "threads": threads, "device": device}
-    settings = settings_from(config, assignments, {**options, "detector.include_masks": masks})
+    settings = settings_from(config, assignments, {**options, "runtime": runtime, "detector.include_masks": masks})
     from viflow_anomaly.cli.pair_files import PairFiles, load_pair
     from viflow_anomaly.detection import to_json
     from viflow_anomaly.motor_input import require_supported

@@ -15,6 +15,7 @@ from viflow_anomaly.cli.options import (
     Checkpoint,
     ConfigFile,
     Device,
+    Runtime,
     Threads,
     load_detector,
     settings_from,
@@ -47,6 +48,7 @@ def detect(
     calibration: Calibration = None,
     threads: Threads = None,
     device: Device = None,
+    runtime: Runtime = None,
     config: ConfigFile = None,
     assignments: Assignments = None,
 ) -> None:
@@ -63,7 +65,7 @@ def detect(
       viflow-anomaly evaluate detect runs/held-out/* --no-rivals --set detector.correction.enabled=false --json
     """
     options = {"checkpoint": checkpoint, "calibration": calibration, "threads": threads, "device": device}
-    settings = settings_from(config, assignments, options)
+    settings = settings_from(config, assignments, {**options, "runtime": runtime})
     from viflow_anomaly.evaluation.detection_methods import OURS, DetectorMethod, rival_methods
     from viflow_anomaly.evaluation.detection_quality import measure_detection
     from viflow_anomaly.evaluation.detection_report import detection_report

@@ -21,7 +21,7 @@ from viflow_anomaly.cli.flow_inputs import (
     result_files,
     test_parts,
 )
-from viflow_anomaly.cli.options import AsJson, Assignments, ConfigFile, Device, Threads, settings_from
+from viflow_anomaly.cli.options import AsJson, Assignments, ConfigFile, Device, Runtime, Threads, settings_from
 from viflow_anomaly.cli.progress import stderr_progress
 from viflow_anomaly.cli.tables import report_console, rich_table
 
@@ -92,6 +92,7 @@ def flow(
     ] = None,
     threads: Threads = None,
     device: Device = None,
+    runtime: Runtime = None,
     config: ConfigFile = None,
     assignments: Assignments = None,
 ) -> None:
@@ -110,7 +111,7 @@ def flow(
 
       viflow-anomaly evaluate flow runs/held-out/* --methods identity,dis-medium --results FlowNet2=results/flownet2
     """
-    settings = settings_from(config, assignments, {"threads": threads, "device": device})
+    settings = settings_from(config, assignments, {"threads": threads, "device": device, "runtime": runtime})
     import cv2
 
     from viflow_anomaly.evaluation.flow_report import flow_report

@@ -165,7 +165,13 @@ def networks_of(named: Sequence[tuple[str | None, Path | None]], settings: Setti
 
     methods = []
     for name, path in named:
-        runtime, record = load_runtime(path, runtime=settings.runtime, device=settings.device, threads=settings.threads)
+        runtime, record = load_runtime(
+            path,
+            runtime=settings.runtime,
+            device=settings.device,
+            threads=settings.threads,
+            precision=settings.network_precision,
+        )
         methods += network_methods(name or record.name, runtime, record, settings.detector.correction)
     return methods
 

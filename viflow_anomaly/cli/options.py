@@ -42,6 +42,9 @@ TrainingThreads = Annotated[
     int | None, typer.Option(min=1, metavar="N", help="CPU threads; another number gives other weights (default 1).")
 ]
 Device = Annotated[str | None, typer.Option(metavar="DEVICE", help="cpu (default), cuda, cuda:1, ...")]
+Runtime = Annotated[
+    str | None, typer.Option(metavar="NAME", help="auto (default), openvino, onnxruntime or torch: docs/runtimes.md.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on stdout, and nothing else there.")]
 
 
@@ -88,6 +91,7 @@ def load_detector(settings: Settings, *, evidence: bool = True) -> AnomalyDetect
         threads=settings.threads,
         evidence_head=settings.evidence_head,
         precision=settings.precision,
+        network_precision=settings.network_precision,
         with_evidence=evidence,
     )
     return calibrated(detector, settings.calibration)

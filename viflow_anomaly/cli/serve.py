@@ -13,6 +13,7 @@ from viflow_anomaly.cli.options import (
     Checkpoint,
     ConfigFile,
     Device,
+    Runtime,
     Threads,
     settings_from,
 )
@@ -29,6 +30,7 @@ def serve(
     calibration: Calibration = None,
     threads: Threads = None,
     device: Device = None,
+    runtime: Runtime = None,
     config: ConfigFile = None,
     assignments: Assignments = None,
 ) -> None:
@@ -41,7 +43,7 @@ def serve(
       viflow-anomaly serve --host 0.0.0.0 --port 8000
     """
     options = {"checkpoint": checkpoint, "calibration": calibration, "threads": threads, "device": device}
-    settings = settings_from(config, assignments, options)
+    settings = settings_from(config, assignments, {**options, "runtime": runtime})
     _refuse_other_limits(settings.limits)
     # By name: the service is built on the library, so no module of the library may import it.
     service_settings = import_module("viflow_anomaly_service.settings")
@@ -53,6 +55,7 @@ def serve(
             checkpoint=settings.checkpoint,
             evidence_head=settings.evidence_head,
             precision=settings.precision,
+            network_precision=settings.network_precision,
             calibration=settings.calibration,
             threads=settings.threads,
             device=settings.device,

@@ -108,7 +108,7 @@ class NetworkMethod:
             corrected=correction.enabled,
             details={
                 "model": {"name": record.name, "version": record.version, "sha256": record.sha256},
-                "runtime": runtime.name,
+                **runtime.backend._asdict(),
             },
         )
 

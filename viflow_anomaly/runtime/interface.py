@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol
 from viflow_anomaly.correction import RigidMotion
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.model_input import ModelInput
+from viflow_anomaly.pair_detector import Backend
 from viflow_anomaly.sensor_data import Float64Array
 
 
@@ -46,8 +47,8 @@ class Runtime(Protocol):
     """Runs one network. Holds weights only, so that threads may share it."""
 
     @property
-    def name(self) -> str:
-        """``torch`` or ``openvino``."""
+    def backend(self) -> Backend:
+        """What runs it, on which device, in which precision."""
 
     def predict(self, model_input: ModelInput) -> Hypotheses:
         """All hypotheses of one pair."""
@@ -67,6 +68,10 @@ class HeadAnswer(NamedTuple):
 
 class EvidenceRuntime(Protocol):
     """Runs one evidence head; threads may share it, too."""
+
+    @property
+    def backend(self) -> Backend:
+        """As ``Runtime.backend``."""
 
     def judge(self, photometric: Float32Array, geometric: Float32Array) -> HeadAnswer:
         """For cues [3, H', W'] and [13, H' / 4, W' / 4]."""

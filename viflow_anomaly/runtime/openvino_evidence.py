@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
-from viflow_anomaly.checkpoint_record import EvidenceRecord, corrupt_checkpoint
+from viflow_anomaly.checkpoint_record import EvidenceRecord
 from viflow_anomaly.config import EVIDENCE_BLOCK_PX, Precision
 from viflow_anomaly.geometry import Float32Array
-from viflow_anomaly.runtime.exported import HEAD_KEY
+from viflow_anomaly.pair_detector import Backend
+from viflow_anomaly.runtime.exported import Export, require_head
 from viflow_anomaly.runtime.interface import HeadAnswer
 from viflow_anomaly.runtime.openvino_blocks import (
     CUES,
@@ -24,9 +23,11 @@ from viflow_anomaly.runtime.openvino_network import OpenvinoNetwork, Size
 
 
 class OpenvinoEvidence:
-    """Runs the head's ``NAME.onnx``; arguments and errors as ``OpenvinoNetwork``."""
+    """Runs an export of the head; arguments and errors as ``OpenvinoNetwork``, and as ``require_head``."""
 
-    def __init__(self, path: Path, record: EvidenceRecord, *, threads: int = 1, precision: Precision = "auto") -> None:
+    def __init__(
+        self, export: Export, record: EvidenceRecord, *, threads: int = 1, precision: Precision = "auto"
+    ) -> None:
         counts = (len(record.photometric_cues), len(record.geometric_cues))
 
         def shapes(size: Size) -> dict[str, list[int]]:
@@ -34,11 +35,9 @@ class OpenvinoEvidence:
             cues = {"photometric": [1, counts[0], *size], "geometric": [1, counts[1], *blocks]}
             return {**cues, CUES: [1, *blocks, -(-(counts[0] * PIXELS + counts[1]) // QUAD_VALUES) * QUAD_VALUES]}
 
-        self._network = OpenvinoNetwork(
-            path, record, shapes=shapes, adapt=by_blocks, threads=threads, precision=precision
-        )
-        if HEAD_KEY not in self._network.metadata:
-            raise corrupt_checkpoint(path, "expected the export of an evidence head, found another network's")
+        self._network = OpenvinoNetwork(export, shapes=shapes, adapt=by_blocks, threads=threads, precision=precision)
+        require_head(export, self._network.metadata, record)
+        self.backend = Backend("openvino", "cpu", self._network.precision)
 
     def judge(self, photometric: Float32Array, geometric: Float32Array) -> HeadAnswer:
         height, width = photometric.shape[1:]

@@ -2,37 +2,28 @@
 
 from __future__ import annotations
 
-import hashlib
 import threading
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import openvino
 
-from viflow_anomaly.checkpoint_record import EvidenceRecord, TensorRecord, corrupt_checkpoint, read_checkpoint_file
 from viflow_anomaly.config import Precision
-from viflow_anomaly.errors import CheckpointError
+from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.geometry import Float32Array
-from viflow_anomaly.runtime.exported import exported_metadata
+from viflow_anomaly.runtime.exported import Export, foreign
 
 Size = tuple[int, int]
 MAX_SIZES = 8
 """Compiled networks kept; one takes a few megabytes and some 100 ms to make."""
 
 
-def _require_fresh(path: Path, data: bytes, record: TensorRecord) -> None:
-    """An export must be the very file that was made from its checkpoint as it is now: the record names its checksum."""
-    found = hashlib.sha256(data).hexdigest()
-    if found != record.onnx_sha256:
-        option = "--evidence-head" if isinstance(record, EvidenceRecord) else "--checkpoint"
-        raise CheckpointError(
-            f"{path}: expected the export that {path.with_suffix('.json').name} names, sha256 {record.onnx_sha256}, "
-            f"found {found}: altered, or older than the checkpoint; make it anew with "
-            f"viflow-anomaly export {option} {path.with_suffix('.safetensors')}",
-            code="export_stale",
-            field="checkpoint",
-        )
+def exported_metadata(model: Any) -> dict[str, str]:
+    """What an export says of itself, from either of its formats; empty where it says nothing."""
+    info = model.get_rt_info()
+    if "framework" not in info:
+        return {}
+    return {str(key): str(value.astype(str)) for key, value in info["framework"].items()}
 
 
 class Request(NamedTuple):
@@ -56,46 +47,47 @@ class Request(NamedTuple):
 
 
 class OpenvinoNetwork:
-    """Reads ``NAME.onnx``.
+    """Reads an export.
 
     Args:
-        path: of the exported network.
-        record: of the checkpoint that it must have been exported from.
+        export: of a network.
         shapes: of the inputs that depend on the size (height, width) of what is seen; those that the network has
             not are passed over.
         adapt: changes the network that was read before it is compiled.
         threads: of one prediction.
-        precision: "auto" computes in bfloat16 where the CPU has it.
+        precision: "auto" computes in bfloat16 where the CPU has it; "int8" is the export's own, the rest in float32.
 
     Raises:
-        CheckpointError: ``export_stale``: altered, or the checkpoint was replaced after it; ``checkpoint_corrupt``.
+        CheckpointError: ``checkpoint_corrupt``.
+        ConfigError: ``precision_unavailable`` for bfloat16 on a CPU without it.
     """
 
     def __init__(
         self,
-        path: Path,
-        record: TensorRecord,
+        export: Export,
         *,
         shapes: Callable[[Size], dict[str, list[int]]],
         adapt: Callable[[Any], None] | None = None,
         threads: int,
         precision: Precision = "f32",
     ) -> None:
-        data = read_checkpoint_file(path)
-        _require_fresh(path, data, record)
         self._core = openvino.Core()
+        self._export = export
         try:
-            self.metadata = exported_metadata(self._core.read_model(data))
+            self.metadata = exported_metadata(self._read())
         except RuntimeError as err:
-            raise corrupt_checkpoint(
-                path, f"expected an ONNX network of this package, found: {str(err)[-200:]}"
-            ) from err
-        self._data = data
+            raise foreign(export, str(err)[-200:]) from err
         self._shapes = shapes
         self._adapt = adapt
         self._threads = threads
         has_bfloat16 = "BF16" in self._core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
-        self._precision = "bf16" if precision == "auto" and has_bfloat16 else "f32"
+        if precision == "bf16" and not has_bfloat16:
+            raise ConfigError(
+                "precision: expected a CPU that computes in bfloat16 for 'bf16', found one that does not",
+                code="precision_unavailable",
+                field="precision",
+            )
+        self.precision = precision if precision != "auto" else "bf16" if has_bfloat16 else "f32"
         self._compiled: dict[Size, Any] = {}
         self._lock = threading.Lock()
         self._requests = threading.local()
@@ -110,11 +102,15 @@ class OpenvinoNetwork:
             request = requests[size] = Request.of(self._compile(size))
         return request
 
+    def _read(self) -> Any:
+        export = self._export
+        return self._core.read_model(export.data, *(() if export.weights is None else (export.weights,)))
+
     def _compile(self, size: Size) -> Any:
         with self._lock:
             compiled = self._compiled.get(size)
             if compiled is None:
-                model = self._core.read_model(self._data)
+                model = self._read()
                 if self._adapt is not None:
                     self._adapt(model)
                 names = {port.get_any_name() for port in model.inputs}
@@ -123,7 +119,7 @@ class OpenvinoNetwork:
                     model,
                     "CPU",
                     {
-                        "INFERENCE_PRECISION_HINT": self._precision,
+                        "INFERENCE_PRECISION_HINT": "bf16" if self.precision == "bf16" else "f32",
                         "INFERENCE_NUM_THREADS": self._threads,
                         "NUM_STREAMS": 0,  # in the caller's thread: no hand-over, and callers run side by side
                         "ENABLE_CPU_PINNING": False,

@@ -2,44 +2,44 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from viflow_anomaly.checkpoint_record import CheckpointRecord, corrupt_checkpoint
-from viflow_anomaly.config import ModelConfig
+from viflow_anomaly.checkpoint_record import CheckpointRecord
+from viflow_anomaly.config import Precision
 from viflow_anomaly.model_input import ModelInput
-from viflow_anomaly.runtime.exported import FLOW_STRIDE_KEY, MODEL_KEY
+from viflow_anomaly.pair_detector import Backend
+from viflow_anomaly.runtime.exported import Export, require_network
 from viflow_anomaly.runtime.interface import Hypotheses, Scene
 from viflow_anomaly.runtime.openvino_network import OpenvinoNetwork
 
 
 class OpenvinoRuntime:
-    """Runs ``NAME.onnx``.
+    """Runs an export of the network.
 
     Args:
-        path: of the exported network.
+        export: of the network.
         record: of the checkpoint that it must have been exported from.
         threads: of one prediction.
+        precision: "auto" is "f32".
 
     Raises:
-        CheckpointError: as ``OpenvinoNetwork``.
+        CheckpointError: as ``OpenvinoNetwork`` and ``require_network``.
+        ConfigError: as ``OpenvinoNetwork``.
     """
 
-    name = "openvino"
-
-    def __init__(self, path: Path, record: CheckpointRecord, *, threads: int = 1) -> None:
-        self._network = OpenvinoNetwork(path, record, shapes=lambda size: {"source": [1, 1, *size]}, threads=threads)
-        try:
-            same_model = ModelConfig.model_validate_json(self._network.metadata[MODEL_KEY]) == record.model
-            self._stride = int(self._network.metadata[FLOW_STRIDE_KEY])
-        except (LookupError, ValueError) as err:
-            raise corrupt_checkpoint(
-                path, f"expected an ONNX network of this package, found: {str(err)[-200:]}"
-            ) from err
-        if not same_model:
-            raise corrupt_checkpoint(path, f"expected the model configuration of {path.with_suffix('.json')} in it")
+    def __init__(
+        self, export: Export, record: CheckpointRecord, *, threads: int = 1, precision: Precision = "auto"
+    ) -> None:
+        self._network = OpenvinoNetwork(
+            export,
+            shapes=lambda size: {"source": [1, 1, *size]},
+            threads=threads,
+            precision="f32" if precision == "auto" else precision,
+        )
+        self._stride = require_network(export, self._network.metadata, record)
+        self.backend = Backend("openvino", "cpu", self._network.precision)
 
     def predict(self, model_input: ModelInput) -> Hypotheses:
         """All hypotheses of one pair."""

@@ -7,8 +7,16 @@ import torch
 from torch import nn
 
 from viflow_anomaly.batch import collate
+from viflow_anomaly.config import Precision
 from viflow_anomaly.model_input import ModelInput
+from viflow_anomaly.pair_detector import Backend
 from viflow_anomaly.runtime.interface import Hypotheses, Scene
+
+
+def bfloat16_where(backend: Backend) -> torch.autocast:
+    """A context in which convolutions and products are bfloat16's, where the backend says so."""
+    enabled = backend.precision == "bf16"
+    return torch.autocast(torch.device(backend.device).type if enabled else "cpu", torch.bfloat16, enabled)
 
 
 class TorchRuntime:
@@ -17,19 +25,19 @@ class TorchRuntime:
     Args:
         network: of this package; moved to ``device``.
         device: torch device name.
+        precision: "auto" is bfloat16 on CUDA, else float32; "bf16" is torch's autocast.
     """
 
-    name = "torch"
-
-    def __init__(self, network: nn.Module, *, device: str = "cpu") -> None:
-        self._device = device
+    def __init__(self, network: nn.Module, *, device: str = "cpu", precision: Precision = "auto") -> None:
+        self._device = torch.device(device)
+        in_bfloat16 = precision == "bf16" or (precision == "auto" and self._device.type == "cuda")
+        self.backend = Backend("torch", device, "bf16" if in_bfloat16 else "f32")
         self._network: nn.Module = network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def predict(self, model_input: ModelInput) -> Hypotheses:
         """All hypotheses of one pair."""
         batch = collate([model_input], self._device)
-        cuda = torch.device(self._device).type == "cuda"
-        with torch.inference_mode(), torch.autocast("cuda", dtype=torch.bfloat16, enabled=cuda):
+        with torch.inference_mode(), bfloat16_where(self.backend):
             source = batch.source.contiguous(memory_format=torch.channels_last)
             output = self._network(source, batch.motion, batch.interval_s, batch.motor)
         scene = None
