@@ -1,7 +1,7 @@
 """How long a user waits: ``--help``, ``detect`` on one pair, ``serve`` until it is ready; and which imports take it.
 
-Each command runs in a process of its own, the files in the page cache (the first run of each is not counted). Times hold
-for a machine with nothing else to do; where other programs took part of the cores the verdict says so.
+Each command runs in a process of its own, the files in the page cache (the first run of each is not counted). Times
+hold for a machine with nothing else to do; where other programs took part of the cores the verdict says so.
 
     python benchmarks/startup.py --out benchmarks/results/startup.json
 """
@@ -100,7 +100,7 @@ def measure(call: Callable[[], Spent], rounds: int) -> list[Spent]:
 
 
 def judge(name: str, all_of: Sequence[Spent]) -> dict[str, Any]:
-    """The median against the budget; disturbed times that keep it are as good as others, those that miss it say little."""
+    """The median against the budget; disturbed times that keep it are as good as others, others say little."""
     median_s, budget_s = statistics.median(one.wall_s for one in all_of), BUDGET_S[name]
     undisturbed = all(one.undisturbed for one in all_of)
     verdict = (
