@@ -16,6 +16,7 @@ import multiprocessing
 import os
 import statistics
 import tempfile
+import threading
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -133,8 +134,18 @@ def memory_of(folder: Path, frames: int, jobs: int) -> dict[str, float]:
 def _peaks(folder: Path, frames: int, jobs: int) -> tuple[float, float]:
     keep_freed_memory()
     recording = repeated(open_recording(folder, limits=ImageLimits()), frames)
-    run_once(recording, "auto", load_detector(settings_of("auto")), jobs)
-    return peak_memory_mib(), peak_memory_mib(children=True) if jobs > 1 else 0.0
+    detector, ended, helpers = load_detector(settings_of("auto")), threading.Event(), [0.0]
+
+    def watch() -> None:
+        while not ended.wait(0.05):
+            helpers.extend(peak_memory_mib(child.pid) for child in multiprocessing.active_children())
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    run_once(recording, "auto", detector, jobs)
+    ended.set()
+    watcher.join()
+    return peak_memory_mib(), max(helpers)
 
 
 def markdown(results: Sequence[dict[str, Any]], memory: Sequence[dict[str, float]]) -> str:

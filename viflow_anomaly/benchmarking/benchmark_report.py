@@ -64,10 +64,11 @@ def _plain(title: str, rows: Sequence[Mapping[str, Any]]) -> Table:
 def markdown(report: Mapping[str, Any], tables: Sequence[Table]) -> str:
     """The whole report."""
     versions = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
+    changes = " with uncommitted changes" if report["uncommitted_changes"] else ""
     about = (
         f"{report['cpu']}, {report['cores']} usable cores, load {report['load_1min']} before and "
         f"{report['load_1min_after']} after; {report['date']}, commit {report['commit'] or 'of an installed package'}"
-        f"{' with uncommitted changes' if report['uncommitted_changes'] else ''}; Python {report['python']}, {versions}."
+        f"{changes}; Python {report['python']}, {versions}."
     )
     parts = ["# Benchmark", about, *map(_markdown_table, tables)]
     parts += [f"Not measured: {reason}" for reason in report["skipped"]]

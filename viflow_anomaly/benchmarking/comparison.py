@@ -12,7 +12,8 @@ from viflow_anomaly.benchmarking.made_scene import make_pair
 from viflow_anomaly.benchmarking.measuring import in_own_process, peak_of, take_turns
 from viflow_anomaly.benchmarking.subjects import HOMOGRAPHY, YARDSTICK, Run, Subject, choose_subjects, load_subject
 from viflow_anomaly.config import RuntimeName
-from viflow_anomaly.errors import ConfigError
+from viflow_anomaly.errors import ConfigError, InvalidInputError
+from viflow_anomaly.sensor_data import FramePair
 
 Size = tuple[int, int]
 OnStep = Callable[[str], None]
@@ -66,7 +67,8 @@ def compare(plan: Plan, on_step: OnStep) -> Comparison:
             runs = _load(plan, threads, skipped)
             for width, height in plan.sizes:
                 on_step(f"{width}x{height} px, {threads} thread{'s' if threads > 1 else ''}")
-                rows += _round(plan, runs, width, height, threads)
+                able = _able(runs, make_pair(width, height), skipped)
+                rows += _round(plan, able, width, height, threads)
     finally:
         cv2.setNumThreads(threads_before)
     if plan.memory:
@@ -89,6 +91,19 @@ def _load(plan: Plan, threads: int, skipped: dict[str, None]) -> dict[Subject, R
                 raise
             skipped[f"{subject.runtime}: {err.message}"] = None
     return runs
+
+
+def _able(runs: dict[Subject, Run], pair: FramePair, skipped: dict[str, None]) -> dict[Subject, Run]:
+    """Those that can judge pairs of this size: the paper's crop asks for 224 pixels."""
+    able = {}
+    for subject, run in runs.items():
+        try:
+            run(pair)
+        except InvalidInputError as err:
+            skipped[f"{subject.preset}: {err.message}"] = None
+        else:
+            able[subject] = run
+    return able
 
 
 def _round(plan: Plan, runs: dict[Subject, Run], width: int, height: int, threads: int) -> list[dict[str, Any]]:

@@ -86,7 +86,7 @@ def by_hypotheses() -> list[dict[str, Any]]:
         for residual in ("winner", "minimum"):
             config = DetectorConfig(evidence="residual", residual="minimum" if residual == "minimum" else "winner")
             assert count in (1, 4, 8)
-            detector = untrained_detector(ModelConfig(hypotheses=count), config, 1)  # type: ignore[arg-type]
+            detector = untrained_detector(ModelConfig(hypotheses=count), config, 1)
             runs[Subject(f"{count}", "torch", residual)] = detector.detect
     times = take_turns(runs, make_pair(224, 224), repeats=REPEATS, budget_s=BUDGET_S)
     return [

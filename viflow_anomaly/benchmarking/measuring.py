@@ -28,17 +28,18 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class Times:
-    """Of one subject on one pair."""
+    """Of one subject on one pair; ``least_ms`` is what other programs disturbed least."""
 
     median_ms: float
     p95_ms: float
     pairs_per_s: float
+    least_ms: float
 
     @classmethod
     def of(cls, samples_ms: list[float]) -> Times:
         median, p95 = np.percentile(samples_ms, (50, 95))
         rate = 1e3 * len(samples_ms) / sum(samples_ms)
-        return cls(round(float(median), 3), round(float(p95), 3), round(rate, 2))
+        return cls(round(float(median), 3), round(float(p95), 3), round(rate, 2), round(min(samples_ms), 3))
 
 
 def take_turns(runs: Mapping[Subject, Run], pair: FramePair, *, repeats: int, budget_s: float) -> dict[Subject, Times]:
