@@ -145,7 +145,7 @@ def _peaks(folder: Path, frames: int, jobs: int) -> tuple[float, float]:
     run_once(recording, "auto", detector, jobs)
     ended.set()
     watcher.join()
-    return peak_memory_mib(), max(helpers)
+    return peak_memory_mib(), max(helpers) if jobs > 1 else 0.0
 
 
 def markdown(results: Sequence[dict[str, Any]], memory: Sequence[dict[str, float]]) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -159,18 +158,18 @@ def draw_curves(curves: dict[str, Any], stem: Path) -> list[Path]:
     from viflow_anomaly.evaluation.plot_style import PAGE_IN, drawing, look, require_matplotlib, saved  # noqa: PLC0415
 
     require_matplotlib()
-    panels: tuple[tuple[str, str, str, str, Callable[[float], float]], ...] = (
-        ("pixels", "pixels", "median_ms", "evidence", float),
-        ("hypotheses", "hypotheses", "median_ms", "residual", float),
-        ("blobs", "blobs", "median_ms", "limits", float),
-        ("length", "frames", "peak_mib", "", float),
+    panels = (
+        ("pixels", "pixels", "median_ms", "evidence"),
+        ("hypotheses", "hypotheses", "median_ms", "residual"),
+        ("blobs", "blobs", "median_ms", "limits"),
+        ("length", "frames", "peak_mib", ""),
     )
     with drawing(stem, width_in=PAGE_IN, height_in=2.4) as figure:
-        for place, (name, x, y, series, number) in enumerate(panels, start=1):
+        for place, (name, x, y, series) in enumerate(panels, start=1):
             axes = figure.add_subplot(1, len(panels), place)
             rows = curves[name]
             for index, key in enumerate(dict.fromkeys(row.get(series, "") for row in rows)):
-                line = [(number(row[x]), number(row[y])) for row in rows if row.get(series, "") == key]
+                line = [(row[x], row[y]) for row in rows if row.get(series, "") == key]
                 style = look(index)
                 axes.plot(
                     *zip(*line, strict=True), color=style.color, marker=style.marker, ls=style.line, label=str(key)
@@ -178,6 +177,7 @@ def draw_curves(curves: dict[str, Any], stem: Path) -> list[Path]:
             if name in ("pixels", "blobs"):
                 axes.set_xscale("log")
                 axes.set_yscale("log")
+                axes.tick_params(which="minor", labelbottom=False)
             else:
                 axes.set_ylim(bottom=0)
             axes.set_xlabel(x)
