@@ -1,7 +1,7 @@
 # make demo   a virtual environment of its own, then the main job on the bundled model and the bundled sample
 # make test   the gate: lint, format, strict types, import direction, tests with a branch-coverage floor
 # Others: lint, model and head (simulate, train, measure), evaluate, reproduction (the paper's table), detection-suite,
-# detection-ablations, detection-robustness, thin-structures, wheel, clean, distclean. Needs Python >= 3.11, make and git;
+# detection-ablations, detection-robustness, thin-structures, benchmark, wheel, clean, distclean. Needs Python >= 3.11, make and git;
 # fetches from package indexes only.
 
 SHELL := /bin/bash
@@ -37,6 +37,7 @@ HELD_OUT_SEQUENCES ?= 12
 HELD_OUT_FRAMES ?= 20
 
 .PHONY: demo test lint model head held-out evaluate reproduction detection-suite detection-ablations detection-robustness thin-structures \
+  benchmark \
   wheel clean distclean
 
 $(VENV)/.torch: constraints.txt
@@ -160,6 +161,12 @@ detection-robustness: held-out
 # False alarms on railings, bare trees, poles and wires, where nothing moves by itself.
 thin-structures: $(VENV)/.installed-dev
 	$(BIN)/python benchmarks/thin_structures.py --jobs $(MODEL_JOBS)
+
+# What a pair, a recording and a start cost on this machine; some minutes, meant for an idle one.
+benchmark: $(VENV)/.installed-dev
+	$(BIN)/viflow-anomaly benchmark --threads 1,2 --curves --out benchmarks/results/benchmark
+	$(BIN)/python benchmarks/batch_throughput.py
+	$(BIN)/python benchmarks/startup.py
 
 clean:
 	rm -rf build dist $(DEMO_OUT) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis .coverage

@@ -30,8 +30,8 @@ from viflow_anomaly.evaluation.detection_report import detection_report
 from viflow_anomaly.evaluation.detection_tables import markdown
 from viflow_anomaly.evaluation.labelled_pairs import SimulatedPairs
 from viflow_anomaly.evaluation.report_files import write_report
-from viflow_anomaly.simulator import simulate
 from viflow_anomaly.simulator.config import SimulatorConfig
+from viflow_anomaly.simulator.run import simulate
 
 FOLDER = Path("runs/detection-suite")
 RESULTS = Path("benchmarks/results/detection-suite")

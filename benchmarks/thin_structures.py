@@ -47,8 +47,8 @@ from viflow_anomaly.evaluation.flow_tables import Table, markdown_table, number_
 from viflow_anomaly.evaluation.report_files import write_report
 from viflow_anomaly.sensor_data import FramePair
 from viflow_anomaly.settings import resolve_settings
-from viflow_anomaly.simulator import simulate
 from viflow_anomaly.simulator.config import SimulatorConfig
+from viflow_anomaly.simulator.run import simulate
 
 FOLDER = Path("runs/thin-structures")
 RESULTS = Path("benchmarks/results/thin-structures")

@@ -437,8 +437,12 @@ def test_a_damaged_end_of_the_observations_is_dropped(tmp_path: Path, tail: byte
     good = path.read_bytes()
     path.write_bytes(good + tail)
     again = RigJournal(path)
-    assert list(again.observations) == [(one.source_ns, one.target_ns), (3, 4)]
-    assert again.observations[3, 4] is None
+    assert len(again) == 2
+    found = again.observation((one.source_ns, one.target_ns))
+    assert found is not None
+    assert found.to_json() == one.to_json()
+    assert not again.lacks((3, 4))
+    assert (again.observation((3, 4)), again.observation((5, 6))) == (None, None)
     assert again.lacks((5, 6))
     assert path.read_bytes() == good
 

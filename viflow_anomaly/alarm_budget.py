@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -101,6 +100,8 @@ class _Levels(NamedTuple):
 
 def rate_bound(alarms: float, hours: float, *, confidence: float, clump: float = 1.0) -> float:
     """Upper confidence bound on the alarms an hour, given so many in ``hours``; exact for clumps of one size."""
+    from scipy.special import gammaincinv  # noqa: PLC0415  # who applies a threshold does not wait for scipy
+
     return clump * float(gammaincinv(alarms / clump + 1.0, confidence)) / hours
 
 

@@ -1,18 +1,20 @@
 """A recording -> ``detections.jsonl``, ``run.json`` and pictures; the main job of the command line.
 
-One pair is in memory at a time. A pair that cannot be judged because its own data is broken is listed in
+A few pairs are in memory at a time. A pair that cannot be judged because its own data is broken is listed in
 ``run.json`` and the others go on. A killed run resumes where it stopped and ends with the same detections as an
-uninterrupted one (``timings_ms`` apart).
+uninterrupted one (``timings_ms`` apart), and so does a run with helpers: pairs are judged side by side, but written
+down, tracked and learnt from in order.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol, Self
+from typing import Any, Literal, NamedTuple, Self
 
 from pydantic import Field, NonNegativeInt, PositiveInt
 
@@ -28,7 +30,8 @@ from viflow_anomaly.batch_files import (
     reopen_results,
     write_json,
 )
-from viflow_anomaly.batch_pictures import PairAnalysis, Pictures, overlay_of
+from viflow_anomaly.batch_pairs import JudgedPair, PairAnalyzer, PairAnswer, PairJudge, PairTask
+from viflow_anomaly.batch_pictures import Pictures
 from viflow_anomaly.batch_record import (
     BatchSummary,
     PairFailure,
@@ -39,15 +42,15 @@ from viflow_anomaly.batch_record import (
 )
 from viflow_anomaly.batch_rig import RigJournal
 from viflow_anomaly.batch_tracking import tracked_lines
+from viflow_anomaly.batch_workers import Helpers, answers_in_order
 from viflow_anomaly.config import FrozenConfig, RigEstimateConfig, TrackingConfig
 from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.datasets.recording import Recording
-from viflow_anomaly.detection import Detection, to_json
+from viflow_anomaly.detection import Detection
 from viflow_anomaly.detection_reading import detection_from_json
-from viflow_anomaly.errors import DatasetError, InvalidInputError, ViflowError
-from viflow_anomaly.pair_detector import DetectorIdentity
-from viflow_anomaly.rig_estimate import RigEstimate, corrected_pair, observe, update
-from viflow_anomaly.sensor_data import FramePair
+from viflow_anomaly.drawing import draw_overlay
+from viflow_anomaly.errors import DatasetError, InvalidInputError
+from viflow_anomaly.rig_estimate import RigEstimate, TurnObservation, update
 from viflow_anomaly.tracking import Tracker, TrackingState
 
 
@@ -69,12 +72,6 @@ class BatchOptions(FrozenConfig):
     overwrite: bool = False
 
 
-class PairAnalyzer(DetectorIdentity, Protocol):
-    """What a batch run needs of ``viflow_anomaly.detector.AnomalyDetector``."""
-
-    def analyze(self, pair: FramePair, *, decode_ms: float = 0.0) -> PairAnalysis: ...
-
-
 OnProgress = Callable[[int, int, int], None]
 """Called after every pair with: pairs behind us, pairs in all, failures so far."""
 
@@ -86,6 +83,7 @@ def run_batch(
     *,
     settings: Mapping[str, Any] | None = None,
     on_progress: OnProgress | None = None,
+    helpers: Helpers | None = None,
 ) -> BatchSummary:
     """Judge every pair of ``recording`` and write the results to ``options.out_dir``.
 
@@ -95,8 +93,11 @@ def run_batch(
         options: where to, which pairs, which pictures.
         settings: other settings of the caller, recorded beside the detector's.
         on_progress: told after every pair.
+        helpers: other processes that judge pairs, too; None, or where ``rig_estimate.apply`` makes each pair depend on
+            the ones before: this process alone.
 
     Raises:
+        ViflowError: ``batch_helper_died``.
         DatasetError: ``recording_too_short``, ``trajectory_missing`` for a model that wants displacements.
         InvalidInputError: ``output_not_empty``, ``output_in_use``, ``options_contradict``,
             ``resume_config_differs``, ``resume_recording_differs``, ``resume_run_unreadable``.
@@ -124,17 +125,17 @@ def run_batch(
         write_json(options.out_dir / RUN_NAME, {"state": "running", **run})
         job = _Job.of(pairs, count, detector, options, journal)
         reused = sum(not job.rig.lacks(stamps) for stamps in journal.lines)
-        failures, state = [], _State(TrackingState(), RigEstimate.prior(options.rig_estimate))
-        for index in range(count):
-            failure, state = _judge(job, index, state)
-            failures += [failure] if failure else []
-            if on_progress:
-                on_progress(index + 1, count, len(failures))
+        failures: list[PairFailure] = []
+        with closing(_answered(job, count, helpers)) as answered:
+            for index, failure in enumerate(answered, start=1):
+                failures += [failure] if failure else []
+                if on_progress:
+                    on_progress(index, count, len(failures))
         journal.publish(options.out_dir / DETECTIONS_NAME, partial(tracked_lines, tracker=job.tracker))
         job.pictures.finish([pairs.stamps(index)[0] for index in range(count)])
         wall_time_s = time.monotonic() - started
         summary = summarise(options.out_dir, journal.lines, failures, reused=reused, wall_time_s=wall_time_s)
-        rig = state.rig.report(options.rig_estimate) if job.rig.observations else None
+        rig = job.state.rig.report(options.rig_estimate) if len(job.rig) else None
         outcome = {**describe_outcome(summary), "rig_estimate": rig}
         write_json(options.out_dir / RUN_NAME, {"state": "done", **run, **outcome})
     return summary
@@ -147,17 +148,18 @@ class _State(NamedTuple):
     rig: RigEstimate
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Job:
-    """The parts of one run."""
+    """The parts of one run, and where it stands."""
 
     pairs: RecordingPairs
-    detector: PairAnalyzer
+    judge: PairJudge
     journal: Journal
     rig: RigJournal
     pictures: Pictures
     tracker: Tracker | None
     rig_config: RigEstimateConfig
+    state: _State
 
     @classmethod
     def of(
@@ -168,43 +170,81 @@ class _Job:
         complete = all(one in journal.lines and not rig.lacks(one) for one in stamps)
         pictures = Pictures(options.out_dir, count, overlays=options.overlays, video=options.video, complete=complete)
         tracker = Tracker(options.tracking) if options.tracking else None
-        return cls(pairs, detector, journal, rig, pictures, tracker, options.rig_estimate)
+        judge = PairJudge(pairs, detector, options.rig_estimate)
+        state = _State(TrackingState(), RigEstimate.prior(options.rig_estimate))
+        return cls(pairs, judge, journal, rig, pictures, tracker, options.rig_estimate, state)
 
-    def is_done(self, stamps: Stamps) -> bool:
+    def is_known(self, stamps: Stamps) -> bool:
         return stamps in self.journal.lines and not self.rig.lacks(stamps)
 
-
-def _judge(job: _Job, index: int, state: _State) -> tuple[PairFailure | None, _State]:
-    """Detect, draw and write down one pair, or say why that cannot be done."""
-    stamps, journal, pictures = job.pairs.stamps(index), job.journal, job.pictures
-    draw = pictures.missing(index, stamps[0])
-    known = job.is_done(stamps)
-    if known and not draw:
-        followed = _followed(job.tracker, state.tracking, journal.text(stamps))[0] if pictures.any else state.tracking
-        return None, _State(followed, _learned(job, state.rig, stamps))
-    applied = state.rig.applicable(job.rig_config)
-    try:
-        started = time.perf_counter()
-        pair = corrected_pair(job.pairs[index], applied)
-        decode_ms = (time.perf_counter() - started) * 1e3
-        analysis = job.detector.analyze(pair, decode_ms=decode_ms)
-    except ViflowError as err:
-        return PairFailure(*stamps, err.code, err.field, err.message), state
-    text, tracking = to_json(analysis.detection), state.tracking
-    if pictures.any:
-        tracking, tracked = _followed(job.tracker, tracking, journal.text(stamps) if known else text)
-        if draw:
-            pictures.write(index, stamps[0], overlay_of(pair, analysis, tracked))
-    if not known:
-        if job.rig_config.enabled and analysis.predicted is not None:
-            job.rig.append(stamps, observe(pair, analysis.predicted.correction, job.rig_config, applied))
-        journal.append(stamps, analysis.detection.status, text)
-    return None, _State(tracking, _learned(job, state.rig, stamps))
+    def wants(self, index: int) -> bool:
+        """Whether the pair must be judged: nobody did, or its picture is missing."""
+        stamps = self.pairs.stamps(index)
+        return not self.is_known(stamps) or self.pictures.missing(index, stamps[0])
 
 
-def _learned(job: _Job, rig: RigEstimate, stamps: Stamps) -> RigEstimate:
+def _answered(job: _Job, count: int, helpers: Helpers | None) -> Generator[PairFailure | None, None, None]:
+    """One pair after the other: judged where that is needed, taken over from an earlier run where not."""
+    wanted = [index for index in range(count) if job.wants(index)]
+    # A task is made when somebody takes it: alone, that is after the pair before it.
+    tasks = (
+        PairTask(
+            index, job.pictures.missing(index, job.pairs.stamps(index)[0]), job.state.rig.applicable(job.rig_config)
+        )
+        for index in wanted
+    )
+    alone = helpers is None or (job.rig_config.enabled and job.rig_config.apply)
+    with closing(answers_in_order(tasks, len(wanted), job.judge, None if alone else helpers)) as answers:
+        pending = iter(wanted)
+        following = next(pending, None)
+        for index in range(count):
+            if index == following:
+                yield _take(job, index, next(answers))
+                following = next(pending, None)
+            else:
+                _follow(job, job.pairs.stamps(index))
+                yield None
+
+
+def _take(job: _Job, index: int, answer: PairAnswer) -> PairFailure | None:
+    """Draw and write down what was made of a pair."""
+    if isinstance(answer, PairFailure):
+        return answer
+    stamps = job.pairs.stamps(index)
+    known = job.is_known(stamps)
+    tracking = job.state.tracking
+    if job.pictures.any:
+        tracking, tracked = _followed(job.tracker, tracking, job.journal.text(stamps) if known else answer.text)
+        if answer.parts is not None:
+            job.pictures.write(
+                index, stamps[0], draw_overlay(answer.parts.source, tracked, residual=answer.parts.residual)
+            )
+    if known:
+        observation = job.rig.observation(stamps)
+    else:
+        observation = answer.observation
+        _write_down(job, stamps, answer)
+    job.state = _State(tracking, _learned(job, observation))
+    return None
+
+
+def _write_down(job: _Job, stamps: Stamps, judged: JudgedPair) -> None:
+    if judged.knows_turn:
+        job.rig.append(stamps, judged.observation)
+    job.journal.append(stamps, judged.status, judged.text)
+
+
+def _follow(job: _Job, stamps: Stamps) -> None:
+    """Past a pair that an earlier run judged, and drew where it should."""
+    tracking = job.state.tracking
+    if job.pictures.any:
+        tracking, _ = _followed(job.tracker, tracking, job.journal.text(stamps))
+    job.state = _State(tracking, _learned(job, job.rig.observation(stamps)))
+
+
+def _learned(job: _Job, observation: TurnObservation | None) -> RigEstimate:
     """One step of the rig's estimate, from what is written down."""
-    observation = job.rig.observations.get(stamps)
+    rig = job.state.rig
     return rig if observation is None else update(rig, observation, job.rig_config)
 
 

@@ -19,13 +19,12 @@ class RigJournal:
 
     Opening it drops what stands behind the first line that is cut or unreadable.
 
-    Attributes:
-        observations: (source, target) stamps -> what that pair said; None: nothing.
+    What a line says stays on disk: only where it stands is in memory, however long the recording.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.observations: dict[Stamps, TurnObservation | None] = {}
+        self._lines: dict[Stamps, tuple[int, int]] = {}  # offset, length
         if not path.exists():
             return
         end = 0
@@ -34,21 +33,35 @@ class RigJournal:
                 entry = _parse_line(raw)
                 if entry is None:
                     break
-                self.observations[entry[0]] = entry[1]
+                self._lines[entry[0]] = end, len(raw)
                 end += len(raw)
             file.truncate(end)
 
     def lacks(self, stamps: Stamps) -> bool:
         """Whether others were written down and this one was lost (a power cut): its pair is judged once more."""
-        return bool(self.observations) and stamps not in self.observations
+        return bool(self._lines) and stamps not in self._lines
+
+    def __len__(self) -> int:
+        return len(self._lines)
+
+    def observation(self, stamps: Stamps) -> TurnObservation | None:
+        """What that pair said; None: nothing, or it is not there."""
+        if stamps not in self._lines:
+            return None
+        offset, length = self._lines[stamps]
+        with self._path.open("rb") as file:
+            file.seek(offset)
+            entry = _parse_line(file.read(length))
+        return None if entry is None else entry[1]
 
     def append(self, stamps: Stamps, observation: TurnObservation | None) -> None:
         """Add one pair's; it survives a killed process at once."""
         told = None if observation is None else observation.to_json()
         line = {"source_timestamp_ns": stamps[0], "target_timestamp_ns": stamps[1], "observation": told}
+        raw = json.dumps(line).encode() + b"\n"
         with self._path.open("ab") as file:
-            file.write(json.dumps(line).encode() + b"\n")
-        self.observations[stamps] = observation
+            self._lines[stamps] = file.tell(), len(raw)
+            file.write(raw)
 
 
 def _parse_line(raw: bytes) -> tuple[Stamps, TurnObservation | None] | None:

@@ -17,7 +17,6 @@ from typing import Any, Literal, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from skimage.measure import label as label_components
 
 from viflow_anomaly.config import RegionConfig
 from viflow_anomaly.geometry import Float32Array
@@ -230,6 +229,8 @@ def _component_labels(y: IndexArray, x: IndexArray, shape: tuple[int, ...], pitc
     cells = np.zeros([-(-side // pitch_px) for side in shape], dtype=np.bool_)
     cell_y, cell_x = y // pitch_px, x // pitch_px
     cells[cell_y, cell_x] = True
+    from skimage.measure import label as label_components  # noqa: PLC0415  # a fifth of a second of start-up
+
     labels = label_components(cells, connectivity=2)  # type: ignore[no-untyped-call]
     return np.asarray(labels[cell_y, cell_x], dtype=np.intp)
 

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from viflow_anomaly.config import TrackingConfig
 from viflow_anomaly.detection import Detection, ImageSize, Roi
@@ -154,6 +153,8 @@ class Tracker:
         sure = np.array([track.track_id is not None for track in tracks])
         moving = np.array([roi.label == "independent_motion" for roi in rois])
         costs = np.where(near & (sure[:, None] | moving[None]), distances + np.log(spread).sum(axis=-1), TOO_FAR)
+        from scipy.optimize import linear_sum_assignment  # noqa: PLC0415  # a single pair's start-up has no use for it
+
         links = [_Link(track, None) for track in tracks]
         for i, j in zip(*linear_sum_assignment(costs), strict=True):
             if costs[i, j] < TOO_FAR:

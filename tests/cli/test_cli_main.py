@@ -17,7 +17,7 @@ from viflow_anomaly.cli.progress import stderr_progress
 from viflow_anomaly.detection import load_detection_schema
 from viflow_anomaly.errors import CheckpointError
 
-COMMANDS = ("detect", "batch", "calibrate", "simulate", "train", "serve", "schema", "config")
+COMMANDS = ("detect", "batch", "benchmark", "calibrate", "simulate", "train", "serve", "schema", "config")
 HEAVY = {"torch", "cv2", "skimage", "mujoco", "fastapi"}
 
 
@@ -37,6 +37,21 @@ print("loaded:", codes, sorted({HEAVY!r} & set(sys.modules)))
 """
     done = python(code)
     assert done.stdout.splitlines()[-1] == f"loaded: {[0] * len(asked)} []"
+
+
+def test_settings_load_neither_simulator_nor_images() -> None:
+    """What every command pays for."""
+    code = """
+import sys
+import viflow_anomaly.settings
+print(sorted({"cv2", "scipy", "skimage", "viflow_anomaly.simulator.run", "viflow_anomaly.datasets"} & set(sys.modules)))
+"""
+    assert python(code).stdout == "[]\n"
+
+
+def test_a_threshold_is_applied_without_scipy() -> None:
+    code = "import sys, viflow_anomaly.alarm_budget; print('scipy.special' in sys.modules)"
+    assert python(code).stdout == "False\n"
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -169,7 +184,7 @@ def test_simulate_hands_its_settings_over(ask: Ask, tmp_path: Path, monkeypatch:
         on_progress(1, 2)
         return [out / "car_000007"]
 
-    monkeypatch.setattr("viflow_anomaly.simulator.simulate", simulate)
+    monkeypatch.setattr("viflow_anomaly.simulator.run.simulate", simulate)
     what = ["--rig", "car", "--sequences", "2", "--frames", "9", "--seed", "7", "--jobs", "1"]
     answer = ask(["simulate", *what, "--out", str(tmp_path), "--set", "simulator.ground_truth=false"])
     assert (answer.code, answer.out, answer.err) == (0, f"{tmp_path / 'car_000007'}\n", "")

@@ -9,8 +9,8 @@ from small_sequences import small
 
 from viflow_anomaly.errors import MissingDependencyError
 from viflow_anomaly.sensor_data import PinholeCamera
-from viflow_anomaly.simulator import simulate
 from viflow_anomaly.simulator.rendering import SceneRenderer
+from viflow_anomaly.simulator.run import simulate
 from viflow_anomaly.simulator.scene import Scene
 
 

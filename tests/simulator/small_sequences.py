@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from viflow_anomaly.simulator import SimulatorConfig
+from viflow_anomaly.simulator.config import SimulatorConfig
 
 
 def small(rig: str, **changes: object) -> SimulatorConfig:

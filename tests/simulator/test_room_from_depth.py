@@ -12,7 +12,7 @@ from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
 from viflow_anomaly.geometry import pixel_grid, rigid_motion_flow, unproject_pixels
 from viflow_anomaly.ground_truth.point_cloud import PointCloud, make_point_cloud
 from viflow_anomaly.ground_truth.range_image import render_depth
-from viflow_anomaly.simulator import simulate
+from viflow_anomaly.simulator.run import simulate
 
 MAX_DEPTH_M = 40.0
 

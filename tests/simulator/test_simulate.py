@@ -15,7 +15,9 @@ from small_sequences import small
 from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
 from viflow_anomaly.errors import ConfigError, MissingDependencyError
 from viflow_anomaly.geometry import pixel_grid
-from viflow_anomaly.simulator import SimulatorConfig, run, simulate
+from viflow_anomaly.simulator import run
+from viflow_anomaly.simulator.config import SimulatorConfig
+from viflow_anomaly.simulator.run import simulate
 
 
 def stamps_of(sequence: Path) -> list[int]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,11 +26,16 @@ from viflow_anomaly.cli.options import (
 from viflow_anomaly.cli.progress import stderr_progress
 
 if TYPE_CHECKING:
-    from viflow_anomaly.batch_job import BatchOptions, PairAnalyzer
+    from viflow_anomaly.batch_job import BatchOptions
+    from viflow_anomaly.batch_pairs import PairAnalyzer
     from viflow_anomaly.batch_record import BatchSummary
+    from viflow_anomaly.batch_workers import Helpers
     from viflow_anomaly.datasets.recording import Recording
+    from viflow_anomaly.settings import Settings
 
 EXIT_SOME_FAILED = 3
+MAX_DEFAULT_JOBS = 8
+"""More processes than that only by ``--jobs``: each takes some 300 MB."""
 
 
 def _how_many(text: str) -> str:
@@ -61,6 +68,12 @@ def batch(
     track: Annotated[bool, typer.Option("--track/--no-track", help="Number what moves, from pair to pair.")] = True,
     video: Annotated[bool, typer.Option("--video", help="Also write overlay.mp4.")] = False,
     masks: Annotated[bool | None, typer.Option("--masks", help="Add each region's mask (COCO RLE).")] = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=256, metavar="N", help="Pairs judged at a time, a process each; default: one for each core."
+        ),
+    ] = None,
     as_json: AsJson = False,
     checkpoint: Checkpoint = None,
     calibration: Calibration = None,
@@ -72,7 +85,8 @@ def batch(
 ) -> int:
     """Judge every frame pair of a recording: detections.jsonl (a ROI JSON object a line), run.json, pictures.
 
-    Exit code 3 when some pairs failed: run.json names them, the others are done. --json prints run.json.
+    Exit code 3 when some pairs failed: run.json names them, the others are done. --json prints run.json. The results do
+    not depend on --jobs.
 
     [bold]Examples[/bold]
 
@@ -105,9 +119,24 @@ def batch(
     detector = load_detector(settings)
     recorded = settings.model_dump(mode="json", include={"checkpoint", "device", "threads", "limits"})
     recorded["calibration"] = _recorded_calibration(settings.calibration)
-    summary = _run(recording, detector, batch_options, recorded)
+    summary = _run(recording, detector, batch_options, recorded, _helpers(jobs, settings))
     _report(summary, as_json=as_json)
     return EXIT_SOME_FAILED if summary.failures else 0
+
+
+def _helpers(jobs: int | None, settings: Settings) -> Helpers:
+    """The processes beside this one."""
+    from viflow_anomaly.batch_workers import Helpers
+
+    return Helpers((jobs or default_jobs(settings)) - 1, partial(load_detector, settings))
+
+
+def default_jobs(settings: Settings) -> int:
+    """One for each core that this process may use and that no thread of another job takes; on a GPU one in all."""
+    if settings.device != "cpu":
+        return 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(cores // settings.threads, MAX_DEFAULT_JOBS))
 
 
 def _require_successive_frames(calibration: Path | None, look_ahead: int) -> None:
@@ -137,7 +166,9 @@ def default_out_dir(directory: Path) -> Path:
     return whole.with_name(f"{whole.name}-detections")
 
 
-def _run(recording: Recording, detector: PairAnalyzer, options: BatchOptions, recorded: dict[str, Any]) -> BatchSummary:
+def _run(
+    recording: Recording, detector: PairAnalyzer, options: BatchOptions, recorded: dict[str, Any], helpers: Helpers
+) -> BatchSummary:
     from viflow_anomaly.batch_job import run_batch
 
     with stderr_progress() as progress:
@@ -148,7 +179,7 @@ def _run(recording: Recording, detector: PairAnalyzer, options: BatchOptions, re
             progress.update(task, completed=done, total=total, description=description)
 
         try:
-            return run_batch(recording, detector, options, on_progress=show, settings=recorded)
+            return run_batch(recording, detector, options, on_progress=show, settings=recorded, helpers=helpers)
         except KeyboardInterrupt:
             print(f"interrupted: {_kept(options)}", file=sys.stderr)
             raise

@@ -17,6 +17,7 @@ from typer.exceptions import TyperException
 from viflow_anomaly.allocator import keep_freed_memory
 from viflow_anomaly.cli import (
     batch,
+    benchmark,
     calibrate,
     configuration,
     detect,
@@ -51,6 +52,7 @@ for module in (
     train_evidence,
     groundtruth,
     evaluate,
+    benchmark,
     export,
     serve,
     schema,

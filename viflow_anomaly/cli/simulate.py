@@ -47,7 +47,7 @@ def simulate(
         "simulator.jobs": jobs,
     }
     simulator = settings_from(config, assignments, options).simulator
-    from viflow_anomaly.simulator import simulate as simulate_sequences
+    from viflow_anomaly.simulator.run import simulate as simulate_sequences
 
     with stderr_progress() as progress:
         task = progress.add_task("sequences", total=simulator.sequences)
