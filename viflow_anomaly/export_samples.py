@@ -15,7 +15,7 @@ from viflow_anomaly.errors import DatasetError, InvalidInputError
 from viflow_anomaly.model_input import prepare
 from viflow_anomaly.runtime.exported import Feed, network_feed
 from viflow_anomaly.sensor_data import FramePair
-from viflow_anomaly.simulator import simulate
+from viflow_anomaly.simulator.run import simulate
 from viflow_anomaly.simulator.config import SimulatorConfig
 
 MAX_SAMPLES = 96
