@@ -15,8 +15,8 @@ from viflow_anomaly.errors import DatasetError, InvalidInputError
 from viflow_anomaly.model_input import prepare
 from viflow_anomaly.runtime.exported import Feed, network_feed
 from viflow_anomaly.sensor_data import FramePair
-from viflow_anomaly.simulator.run import simulate
 from viflow_anomaly.simulator.config import SimulatorConfig
+from viflow_anomaly.simulator.run import simulate
 
 MAX_SAMPLES = 96
 SIMULATED_SEEDS = {"drone": 36_000, "car": 86_000}

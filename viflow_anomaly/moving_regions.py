@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from skimage.measure import label as label_components
 
 from viflow_anomaly.config import EVIDENCE_BLOCK_PX, RegionConfig, RegionScore
 from viflow_anomaly.evidence_cues import GEOMETRIC_CUES, HALF_PARALLAX_PX, HALF_REMAINING_PX, EvidenceCues
@@ -165,6 +164,8 @@ def _divided(maps: MotionMaps, mask: BoolArray, part: tuple[slice, slice]) -> La
 
 def _labels(mask: BoolArray, seam_logit: Float32Array) -> LabelArray:
     """[H, W] components (1..) of the mask, cut along seams; what is left of a seam joins no component."""
+    from skimage.measure import label as label_components  # noqa: PLC0415  # a fifth of a second of start-up
+
     cut = mask & (seam_logit > SEAM_LOGIT)
     labels, count = label_components(mask & ~cut, connectivity=2, return_num=True)  # type: ignore[no-untyped-call]
     left, top, width, height = cv2.boundingRect(cut.view(np.uint8))
