@@ -246,6 +246,14 @@ def test_fitted_scores_are_probabilities() -> None:
         assert abs(scores[chosen].mean() - new.moving[chosen].mean()) < 0.06
 
 
+def test_a_feature_that_hardly_varies_does_not_decide() -> None:
+    regions, _ = regions_with_truth(400, seed=0)
+    features = regions.features.copy()
+    features[:, 11] = 1.0 - 1e-3 * regions.moving  # a giveaway here, and noise anywhere else
+    fitted = fit_region_score(LabelledRegions(features, regions.moving))
+    assert abs(fitted.weights[11] * 1e-3) < 0.2
+
+
 @given(st.integers(1, 30), st.booleans())
 def test_few_regions_of_one_kind_give_a_finite_score(count: int, moving: bool) -> None:
     features = np.random.default_rng(count).normal(size=(count, len(REGION_FEATURES)))
