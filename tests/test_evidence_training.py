@@ -201,7 +201,8 @@ def test_the_folder_of_calibration_must_be_one(tmp_path: Path) -> None:
 
 
 def test_scores_need_regions(tmp_path: Path, detector: AnomalyDetector) -> None:
-    regions = detector.config.regions.model_copy(update={"min_motion_probability": 0.99})
+    certain = {"min_motion_probability": 0.99, "faint_motion_probability": 0.99}
+    regions = detector.config.regions.model_copy(update=certain)
     never = detector.with_config(detector.config.model_copy(update={"regions": regions}))
     data, calibration = [recording(tmp_path / "drone_1")], [recording(tmp_path / "drone_2")]
     with pytest.raises(DatasetError, match="regions that count"):
