@@ -7,7 +7,7 @@ import pytest
 from test_evidence_cues import pair_of, predicted
 from worlds import textured_image
 
-from viflow_anomaly.alignment import AlignedPair, align
+from viflow_anomaly.alignment import AlignedPair, align, remaining_evidence
 from viflow_anomaly.config import DetectorConfig, ViewConfig
 from viflow_anomaly.explanation import explain
 from viflow_anomaly.geometry import pixel_grid, sample_bilinear
@@ -38,7 +38,9 @@ def aligned(source: Uint8Array, target: Uint8Array, *, depth: bool = True) -> Al
     model_input = ModelInput(source, target, MotionWindow(np.zeros((16, 6), np.float32), 0.05, ()), view)
     flows = predicted((view.width, view.height), (0.05, 0.0, 0.0) if depth else None)
     pair = pair_of(source, target)
-    return align(pair, explain(pair, model_input, flows, CONFIG), CONFIG, focal_px=FOCAL_PX)
+    alignment = align(pair, model_input, flows, focal_px=FOCAL_PX)
+    explained = explain(pair, model_input, flows, CONFIG, coordinates=alignment.target_coordinates)
+    return remaining_evidence(explained, alignment)
 
 
 def inner(values: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from worlds import textured_image
 
-from viflow_anomaly.alignment import align
+from viflow_anomaly.alignment import align, remaining_evidence
 from viflow_anomaly.config import DetectorConfig, ViewConfig
 from viflow_anomaly.correction import Correction, RigidMotion
 from viflow_anomaly.evidence_cues import (
@@ -16,12 +16,11 @@ from viflow_anomaly.evidence_cues import (
     EvidenceCues,
     evidence_cues,
 )
-from viflow_anomaly.explanation import Explanation
+from viflow_anomaly.explanation import explain
 from viflow_anomaly.measured_flow import measure_remaining_flow
 from viflow_anomaly.model_input import ModelInput
 from viflow_anomaly.motion_input import MotionWindow
 from viflow_anomaly.prediction import PredictedFlow
-from viflow_anomaly.residual import half_range_gray, photometric_residual, texture_normalised
 from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples, Uint8Array
 from viflow_anomaly.view import make_view
 
@@ -46,18 +45,12 @@ def predicted(
 def cues_of(source: Uint8Array, rebuilt: Uint8Array, *, translation: tuple[float, float, float] | None) -> EvidenceCues:
     height, width = source.shape
     view = make_view(ViewConfig(), width=width, height=height, camera=None)
-    inside = np.ones(source.shape, np.bool_)
-    reconstruction = rebuilt.astype(np.float32)
-    half_range = half_range_gray(source)
-    normalised = texture_normalised(photometric_residual(source, reconstruction, inside), half_range, 10.0)
     model_input = ModelInput(source, source, MotionWindow(np.zeros((16, 6), np.float32), 0.05, ()), view)
-    flows = predicted((view.width, view.height), translation)
-    residual = photometric_residual(source, reconstruction, inside)
-    coordinates = view.target_coordinates(flows.flow_px, STRIDE)
-    explained = Explanation(
-        source, model_input, flows, coordinates, reconstruction, inside, residual, half_range, normalised
-    )
-    return evidence_cues(align(pair_of(source, rebuilt), explained, DetectorConfig(), focal_px=116.0))
+    flows, pair = predicted((view.width, view.height), translation), pair_of(source, rebuilt)
+    config = DetectorConfig(photometric_compensation=False)
+    alignment = align(pair, model_input, flows, focal_px=116.0)
+    explained = explain(pair, model_input, flows, config, coordinates=alignment.target_coordinates)
+    return evidence_cues(remaining_evidence(explained, alignment))
 
 
 def pair_of(source: Uint8Array, target: Uint8Array) -> FramePair:

@@ -3,8 +3,8 @@
 The network's view may be several times coarser than the image; a third of a pixel there is two pixels here, and every
 edge differs. The flow that remains between source and reconstruction says which small motion of the camera is missing
 (``motion_refinement``), and where a whole neighbourhood is nearer or farther than it was taken for: along epipolar
-lines, many small things that move alike are one wrong depth. Where that matters, the source is rebuilt and the
-remaining flow measured anew; the rest is taken off the measured flow.
+lines, many small things that move alike are one wrong depth. A first look at the halved images moves the coordinates
+where that matters; what a second one, at the full size, still finds is taken off the remaining flow.
 """
 
 from __future__ import annotations
@@ -15,11 +15,13 @@ import cv2
 import numpy as np
 
 from viflow_anomaly.block_geometry import BlockGeometry, block_geometry, padded
-from viflow_anomaly.config import EVIDENCE_BLOCK_PX, DetectorConfig
-from viflow_anomaly.explanation import Explanation, explain_at
-from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.config import EVIDENCE_BLOCK_PX
+from viflow_anomaly.explanation import Explanation
+from viflow_anomaly.geometry import Float32Array, sample_bilinear
 from viflow_anomaly.measured_flow import RemainingFlow, measure_remaining_flow
+from viflow_anomaly.model_input import ModelInput
 from viflow_anomaly.motion_refinement import common_motion_px
+from viflow_anomaly.prediction import PredictedFlow
 from viflow_anomaly.sensor_data import FramePair, Uint8Array
 
 NO_GRAY = np.zeros(4)
@@ -27,8 +29,8 @@ NO_GRAY = np.zeros(4)
 HALF_TEXTURE_GRAY2 = 8.0
 """Of a block whose measured flow is half trusted."""
 MIN_SHIFT_PX = 0.5
-"""A common motion is worth rebuilding the source for, where its root mean square over the blocks is this much."""
-MAX_REBUILDS = 2
+"""A common motion is worth moving the coordinates by, where its root mean square over the blocks is this much."""
+MIN_HALVED_SIDE_PX = 64
 NEIGHBOURHOOD = 1 / 8
 """Side of what is corrected in depth as a whole, in image widths: a smaller thing cannot explain itself away."""
 DEPTH_ROUNDS = 3
@@ -40,6 +42,20 @@ MAX_LOG_DEPTH = 0.7
 PRIOR_TRUST = 1e-3
 
 
+class Alignment(NamedTuple):
+    """Where the static world is in the target image, at the image's own resolution.
+
+    Attributes:
+        target_coordinates: [H, W, 2] float32 of every source pixel.
+        geometry: of the padded image's blocks.
+        log_depth: [h, w] by how much neighbourhoods were brought nearer for it, logarithm of the inverse depth.
+    """
+
+    target_coordinates: Float32Array
+    geometry: BlockGeometry
+    log_depth: Float32Array
+
+
 class AlignedPair(NamedTuple):
     """What the evidence head's cues are made of; maps of the padded image ("H'") and of its blocks ("h").
 
@@ -47,17 +63,15 @@ class AlignedPair(NamedTuple):
         explained: after alignment, at the image's size.
         source: [H', W'] uint8.
         rebuilt: [H', W'] uint8, the reconstruction; the source itself where nothing can be compared.
-        inside: [H', W'] uint8, 1 where it can.
-        inside_share: [h, w] of each block.
+        inside_share: [h, w] of each block: where it can.
         geometry: of the blocks.
         remaining: flow from source to rebuilt that the static world does not explain.
-        log_depth: [h, w] by how much neighbourhoods were brought nearer, logarithm of the inverse depth.
+        log_depth: [h, w] by how much neighbourhoods were brought nearer in all.
     """
 
     explained: Explanation
     source: Uint8Array
     rebuilt: Uint8Array
-    inside: Uint8Array
     inside_share: Float32Array
     geometry: BlockGeometry
     remaining: RemainingFlow
@@ -71,40 +85,78 @@ class _Common(NamedTuple):
     log_depth: Float32Array
 
 
-def align(pair: FramePair, explained: Explanation, config: DetectorConfig, *, focal_px: float) -> AlignedPair:
-    """Measure what remains, and rebuild the source while a common motion is a large part of it.
+def align(pair: FramePair, model_input: ModelInput, predicted: PredictedFlow, *, focal_px: float) -> Alignment:
+    """Correct the predicted coordinates by what the halved images show, where that is worth it.
 
     Args:
         pair: the images.
-        explained: under the predicted flow.
-        config: as for ``explain``.
+        model_input, predicted: what the network saw and said.
         focal_px: that the network takes the view for.
     """
-    geometry = block_geometry(explained.predicted, explained.model_input.view, focal_px)
-    source, log_depth = padded(explained.source), np.zeros_like(geometry.log_ratio)
-    for rebuilds_left in range(MAX_REBUILDS, -1, -1):
-        inside = padded(explained.inside.view(np.uint8), outside=True)
-        rebuilt = padded(np.asarray(cv2.add(explained.reconstruction, NO_GRAY, dtype=cv2.CV_8U), dtype=np.uint8))
-        np.copyto(rebuilt, source, where=inside == 0)
-        blocks = log_depth.shape[::-1]
-        inside_share = np.asarray(cv2.resize(inside * np.float32(1), blocks, interpolation=cv2.INTER_AREA), np.float32)
-        remaining = measure_remaining_flow(source, rebuilt, block_px=EVIDENCE_BLOCK_PX)
-        common = _common(remaining, geometry, inside_share)
-        if common is None:
-            break
+    view = model_input.view
+    coordinates = view.target_coordinates(predicted.flow_px, predicted.stride)
+    geometry = block_geometry(predicted, view, focal_px)
+    as_predicted = Alignment(coordinates, geometry, np.zeros_like(geometry.log_ratio))
+    if geometry.points is None or min(pair.source.image.shape) < MIN_HALVED_SIDE_PX:
+        return as_predicted
+    common = _common(*_remaining_of_halves(pair, coordinates, geometry), geometry)
+    if common is None or _root_mean_square(common.flow_px) < MIN_SHIFT_PX:
+        return as_predicted
+    height, width = pair.source.image.shape
+    sides = tuple(side * EVIDENCE_BLOCK_PX for side in common.log_depth.shape[::-1])
+    shift = cv2.resize(common.flow_px, sides, interpolation=cv2.INTER_LINEAR)[:height, :width]
+    return Alignment(np.asarray(coordinates + shift, dtype=np.float32), geometry, common.log_depth)
+
+
+def remaining_evidence(explained: Explanation, alignment: Alignment) -> AlignedPair:
+    """What the static world leaves of the flow between source and reconstruction, at the image's own resolution."""
+    geometry, source = alignment.geometry, padded(explained.source)
+    inside = padded(explained.inside.view(np.uint8), outside=True)
+    rebuilt = padded(np.asarray(cv2.add(explained.reconstruction, NO_GRAY, dtype=cv2.CV_8U), dtype=np.uint8))
+    np.copyto(rebuilt, source, where=inside == 0)
+    inside_share = _shares(inside, geometry)
+    remaining, log_depth = measure_remaining_flow(source, rebuilt, block_px=EVIDENCE_BLOCK_PX), alignment.log_depth
+    common = _common(remaining, inside_share, geometry)
+    if common is not None:
+        flow_px, local_px = remaining.flow_px - common.flow_px, remaining.local_flow_px - common.flow_px
+        remaining = remaining._replace(flow_px=flow_px, local_flow_px=local_px)
         log_depth = log_depth + common.log_depth
-        if not rebuilds_left or _root_mean_square(common.flow_px) < MIN_SHIFT_PX:
-            flow_px, local_px = remaining.flow_px - common.flow_px, remaining.local_flow_px - common.flow_px
-            remaining = remaining._replace(flow_px=flow_px, local_flow_px=local_px)
-            break
-        height, width = explained.source.shape
-        shift = cv2.resize(common.flow_px, source.shape[::-1], interpolation=cv2.INTER_LINEAR)[:height, :width]
-        coordinates = np.asarray(explained.target_coordinates + shift, dtype=np.float32)
-        explained = explain_at(pair, explained.model_input, explained.predicted, coordinates, config)
-    return AlignedPair(explained, source, rebuilt, inside, inside_share, geometry, remaining, log_depth)
+    return AlignedPair(explained, source, rebuilt, inside_share, geometry, remaining, log_depth)
 
 
-def _common(remaining: RemainingFlow, geometry: BlockGeometry, inside_share: Float32Array) -> _Common | None:
+def _remaining_of_halves(
+    pair: FramePair, coordinates: Float32Array, geometry: BlockGeometry
+) -> tuple[RemainingFlow, Float32Array]:
+    """A first look at a quarter of the pixels, brought to the blocks of the whole image; and what share is inside."""
+    source, target = (padded(frame.image) for frame in (pair.source, pair.target))
+    halves = (source.shape[1] // 2, source.shape[0] // 2)
+    source, target = (
+        np.asarray(cv2.resize(image, halves, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        for image in (source, target)
+    )
+    at = cv2.resize(padded(coordinates), halves, interpolation=cv2.INTER_AREA)
+    at = (at - np.float32(0.5)) * np.float32(0.5)
+    inside = cv2.inRange(at, (0.0, 0.0), ((pair.target.image.shape[1] - 1) / 2, (pair.target.image.shape[0] - 1) / 2))
+    rebuilt = np.asarray(sample_bilinear(target, at), dtype=np.uint8)
+    np.copyto(rebuilt, source, where=inside == 0)
+    halved = measure_remaining_flow(source, rebuilt, block_px=EVIDENCE_BLOCK_PX)
+    blocks = geometry.log_ratio.shape[::-1]
+    flow_px, local_px, mismatch, texture = (
+        np.asarray(cv2.resize(one, blocks, interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+        for one in (halved.flow_px * np.float32(2), halved.local_flow_px * np.float32(2), *halved[1:3])
+    )
+    return RemainingFlow(flow_px, mismatch, texture, local_px), _shares(
+        np.asarray(inside // 255, dtype=np.uint8), geometry
+    )
+
+
+def _shares(inside: Uint8Array, geometry: BlockGeometry) -> Float32Array:
+    """[h, w] of each block."""
+    blocks = geometry.log_ratio.shape[::-1]
+    return np.asarray(cv2.resize(inside * np.float32(1), blocks, interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+def _common(remaining: RemainingFlow, inside_share: Float32Array, geometry: BlockGeometry) -> _Common | None:
     """None where the network gives flow only, and no static world can be told from anything else."""
     if geometry.points is None:
         return None

@@ -9,7 +9,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from viflow_anomaly.alignment import AlignedPair, align
+from viflow_anomaly.alignment import Alignment, align, remaining_evidence
 from viflow_anomaly.checkpoint_record import CheckpointRecord
 from viflow_anomaly.config import DetectorConfig, MotorSource, Precision, RuntimeName
 from viflow_anomaly.detection import (
@@ -209,14 +209,12 @@ class AnomalyDetector:
     def analyze(self, pair: FramePair, *, decode_ms: float = 0.0) -> Analysis:
         """``detect`` with its maps; same errors. The paper's algorithm on one screen."""
         started = time.perf_counter()
-        explained = self._explain(pair)
+        explained, alignment = self._explain(pair)
         findings = self._findings(pair, explained)
-        abstained, judged = any(finding.abstain for finding in findings), None
-        learned = takes_head(self._evidence, explained, self.config)
-        if learned and not abstained:
-            explained, judged = self._judge(pair, explained)
-            if judged is not None and not judged.maps.finite:
-                findings, abstained = (*findings, Finding(HEAD_NOT_FINITE, abstain=True)), True
+        abstained = any(finding.abstain for finding in findings)
+        judged = None if abstained else self._judge(explained, alignment)
+        if judged is not None and not judged.maps.finite:
+            findings, abstained = (*findings, Finding(HEAD_NOT_FINITE, abstain=True)), True
         inferred = time.perf_counter()
         residual = explained.residual
         height, width = residual.shape
@@ -247,6 +245,7 @@ class AnomalyDetector:
             residual=self._summary(explained),
             timings_ms=timings_ms,
         )
+        learned = alignment is not None
         nothing = np.zeros_like(residual) if learned else explained.normalised
         evidence = nothing if judged is None else judged.maps.motion
         maps = (residual, evidence, explained.inside, explained.reconstruction, explained.target_coordinates)
@@ -274,30 +273,32 @@ class AnomalyDetector:
         Raises:
             InvalidInputError: as ``detect``.
         """
-        explained, judged = self._judge(pair, self._explain(pair))
+        explained, alignment = self._explain(pair)
+        judged = self._judge(explained, alignment)
         return None if judged is None else (judged, explained.inside)
 
     def cues(self, pair: FramePair) -> tuple[EvidenceCues, NDArray[np.bool_]]:
         """What the evidence head is shown of a pair, and which pixels [H, W] are inside; errors as ``detect``."""
-        aligned = self._align(pair, self._explain(pair))
-        return evidence_cues(aligned), aligned.explained.inside
+        explained, alignment = self._explain(pair, for_head=True)
+        assert alignment is not None
+        return evidence_cues(remaining_evidence(explained, alignment)), explained.inside
 
-    def _align(self, pair: FramePair, explained: Explanation) -> AlignedPair:
-        return align(pair, explained, self.config, focal_px=self._record.model.view.focal_px)
+    def _judge(self, explained: Explanation, alignment: Alignment | None) -> JudgedCues | None:
+        """What the head makes of it; None: regions are found in the residual."""
+        if self._evidence is None or alignment is None:
+            return None
+        return judge_cues(self._evidence, evidence_cues(remaining_evidence(explained, alignment)), explained)
 
-    def _judge(self, pair: FramePair, explained: Explanation) -> tuple[Explanation, JudgedCues | None]:
-        """The pair aligned, and what the head makes of it; as it was and None: regions are found in the residual."""
-        if self._evidence is None or not takes_head(self._evidence, explained, self.config):
-            return explained, None
-        aligned = self._align(pair, explained)
-        return aligned.explained, judge_cues(self._evidence, evidence_cues(aligned), aligned.explained)
-
-    def _explain(self, pair: FramePair) -> Explanation:
-        """Predict the static world's flow, and see what it leaves unexplained."""
+    def _explain(self, pair: FramePair, *, for_head: bool = False) -> tuple[Explanation, Alignment | None]:
+        """Predict the static world's flow, and see what it leaves unexplained; aligned where the head judges."""
         model_input = prepare(pair, self._record.model)
         focal_px = self._record.model.view.focal_px
         predicted = predict_flow(self._runtime, model_input, self.config.correction, focal_px=focal_px)
-        return explain(pair, model_input, predicted, self.config)
+        if not for_head and not takes_head(self._evidence, predicted, self.config):
+            return explain(pair, model_input, predicted, self.config), None
+        alignment = align(pair, model_input, predicted, focal_px=focal_px)
+        coordinates = alignment.target_coordinates
+        return explain(pair, model_input, predicted, self.config, coordinates=coordinates), alignment
 
 
 def _judge_input(pair: FramePair, window: MotionWindow, config: DetectorConfig) -> tuple[Finding, ...]:

@@ -46,7 +46,14 @@ class Explanation(NamedTuple):
     normalised: Float32Array
 
 
-def explain(pair: FramePair, model_input: ModelInput, predicted: PredictedFlow, config: DetectorConfig) -> Explanation:
+def explain(
+    pair: FramePair,
+    model_input: ModelInput,
+    predicted: PredictedFlow,
+    config: DetectorConfig,
+    *,
+    coordinates: Float32Array | None = None,
+) -> Explanation:
     """Compare a pair under a predicted flow.
 
     Args:
@@ -54,20 +61,11 @@ def explain(pair: FramePair, model_input: ModelInput, predicted: PredictedFlow, 
         model_input: how the network saw them.
         predicted: the flow of the static world.
         config: which residual, and whether an exposure is compensated.
+        coordinates: [H, W, 2] of every source pixel in the target image; None: as predicted.
     """
-    coordinates = model_input.view.target_coordinates(predicted.flow_px, predicted.stride)
-    return explain_at(pair, model_input, predicted, coordinates, config)
-
-
-def explain_at(
-    pair: FramePair,
-    model_input: ModelInput,
-    predicted: PredictedFlow,
-    coordinates: Float32Array,
-    config: DetectorConfig,
-) -> Explanation:
-    """``explain`` with the target coordinates [H, W, 2] of every source pixel known."""
     source, view = pair.source.image, model_input.view
+    if coordinates is None:
+        coordinates = view.target_coordinates(predicted.flow_px, predicted.stride)
     reconstruction, inside = reconstruct(pair.target.image, coordinates)
     if (analyzed := view.analyzed()) is not None:
         inside &= analyzed

@@ -47,48 +47,41 @@ def middles_of(votes: Float64Array) -> Float64Array:
     return np.asarray(np.array(middles) + low, dtype=np.float64)
 
 
-def things_of_blocks(rows: IndexArray, columns: IndexArray, offsets: Float32Array) -> IndexArray:
-    """[N] number of the thing (0..) that each block of one component belongs to.
-
-    Args:
-        rows, columns: [N] of the blocks.
-        offsets: [2, h, w] from every block to its thing's middle, in blocks (y, x).
-    """
-    if len(rows) < MIN_BLOCKS:
-        return np.zeros(len(rows), dtype=np.intp)
-    places = np.column_stack([rows, columns])
-    votes = np.asarray(places + offsets[:, rows, columns].T, dtype=np.float64)
-    middles = middles_of(votes)
-    if len(middles) == 1:
-        return np.zeros(len(rows), dtype=np.intp)
-    distances = ((votes[:, None] - middles[None]) ** 2).sum(axis=-1)
-    return np.asarray(np.unique(distances.argmin(axis=1), return_inverse=True)[1], dtype=np.intp)
-
-
 def things_of_pixels(labels: LabelArray, offsets: Float32Array, origin: tuple[int, int]) -> LabelArray:
-    """[H, W] components (1..) divided into things (1..); the largest keep their component's number.
+    """[H, W] components (1..) divided into things (1..); the first of each keeps its component's number.
 
     Args:
         labels: [H, W] components, 0 is none; a cut-out of the image.
-        offsets: [2, h, w] of the whole image's blocks.
+        offsets: [2, h, w] from every block of the whole image to its thing's middle, in blocks (y, x).
         origin: row and column of the cut-out's first pixel in the image.
     """
-    at = np.flatnonzero(labels)
-    component = labels.reshape(-1)[at]
-    areas_px = np.bincount(component, minlength=1)
-    largest = np.argsort(-areas_px, kind="stable")[:MAX_DIVIDED]
-    divided = largest[areas_px[largest] >= MIN_BLOCKS * EVIDENCE_BLOCK_PX**2]
-    if not divided.size:
-        return labels
-    things, made = labels.copy(), len(areas_px) - 1
-    by_component = at[np.argsort(component, kind="stable")]
-    ends = np.cumsum(areas_px)
-    for number in divided:
-        pixels = by_component[ends[number] - areas_px[number] : ends[number]]
-        rows, columns = pixels // labels.shape[1] + origin[0], pixels % labels.shape[1] + origin[1]
-        blocks = (rows // EVIDENCE_BLOCK_PX) * offsets.shape[2] + columns // EVIDENCE_BLOCK_PX
-        own, which = np.unique(blocks, return_inverse=True)
-        thing = things_of_blocks(own // offsets.shape[2], own % offsets.shape[2], offsets)[which]
-        things.reshape(-1)[pixels] = np.where(thing == 0, number, made + thing)
-        made += int(thing.max())
+    middle = EVIDENCE_BLOCK_PX // 2
+    first = [-(-max(start - middle, 0) // EVIDENCE_BLOCK_PX) for start in origin]  # blocks whose middles are inside
+    starts = [block * EVIDENCE_BLOCK_PX + middle - start for block, start in zip(first, origin, strict=True)]
+    at_blocks = labels[starts[0] :: EVIDENCE_BLOCK_PX, starts[1] :: EVIDENCE_BLOCK_PX]
+    counts = np.bincount(at_blocks.reshape(-1), minlength=1)
+    counts[0] = 0
+    largest = np.argsort(-counts, kind="stable")[:MAX_DIVIDED]
+    things, made = labels, int(labels.max(initial=0))
+    for number in largest[counts[largest] >= MIN_BLOCKS]:
+        rows, columns = np.nonzero(at_blocks == number)
+        rows, columns = rows + first[0], columns + first[1]
+        votes = np.column_stack([rows, columns]) + offsets[:, rows, columns].T
+        middles = middles_of(np.asarray(votes, dtype=np.float64))
+        if len(middles) == 1:
+            continue
+        if things is labels:
+            things = labels.copy()
+        y, x = np.nonzero(labels == number)
+        thing = _nearest(offsets, middles)[(y + origin[0]) // EVIDENCE_BLOCK_PX, (x + origin[1]) // EVIDENCE_BLOCK_PX]
+        things[y, x] = np.where(thing == 0, number, made + thing)
+        made += len(middles) - 1
     return things
+
+
+def _nearest(offsets: Float32Array, middles: Float64Array) -> IndexArray:
+    """[h, w] number of the middle that is nearest to each block's vote."""
+    rows, columns = np.mgrid[0 : offsets.shape[1], 0 : offsets.shape[2]].astype(np.float32)
+    votes = (rows + offsets[0], columns + offsets[1])
+    distances = [(votes[0] - np.float32(y)) ** 2 + (votes[1] - np.float32(x)) ** 2 for y, x in middles]
+    return np.asarray(np.argmin(distances, axis=0), dtype=np.intp)

@@ -13,6 +13,7 @@ from viflow_anomaly.errors import CheckpointError
 from viflow_anomaly.evidence_cues import CUES_VERSION, GEOMETRIC_CUES, PHOTOMETRIC_CUES, EvidenceCues
 from viflow_anomaly.explanation import Explanation
 from viflow_anomaly.moving_regions import REGION_FEATURES, MotionMaps, find_moving_regions, sigmoid
+from viflow_anomaly.prediction import PredictedFlow
 from viflow_anomaly.regions import Region, find_regions
 from viflow_anomaly.runtime.loading import LoadedEvidence
 
@@ -48,11 +49,11 @@ def require_our_cues(record: EvidenceRecord) -> None:
         )
 
 
-def takes_head(head: LoadedEvidence | None, explanation: Explanation, config: DetectorConfig) -> bool:
+def takes_head(head: LoadedEvidence | None, predicted: PredictedFlow, config: DetectorConfig) -> bool:
     """Whether the head judges this pair: "auto" wants a network that knows depth, as the head was trained on."""
     if head is None or config.evidence == "residual":
         return False
-    correction = explanation.predicted.correction
+    correction = predicted.correction
     return config.evidence == "learned" or (correction is not None and correction.motion is not None)
 
 
