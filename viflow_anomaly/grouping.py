@@ -72,16 +72,21 @@ def things_of_pixels(labels: LabelArray, offsets: Float32Array, origin: tuple[in
             continue
         if things is labels:
             things = labels.copy()
-        y, x = np.nonzero(labels == number)
-        thing = _nearest(offsets, middles)[(y + origin[0]) // EVIDENCE_BLOCK_PX, (x + origin[1]) // EVIDENCE_BLOCK_PX]
+        low = [int(one.min()) - 1 for one in (rows, columns)]
+        high = [int(one.max()) + 2 for one in (rows, columns)]
+        part = tuple(
+            slice(max(0, EVIDENCE_BLOCK_PX * below - start), max(0, EVIDENCE_BLOCK_PX * above - start))
+            for below, above, start in zip(low, high, origin, strict=True)
+        )
+        y, x = np.nonzero(labels[part] == number)
+        y, x = y + part[0].start, x + part[1].start
+        thing = _nearest(offsets, middles, (y + origin[0]) // EVIDENCE_BLOCK_PX, (x + origin[1]) // EVIDENCE_BLOCK_PX)
         things[y, x] = np.where(thing == 0, number, made + thing)
         made += len(middles) - 1
     return things
 
 
-def _nearest(offsets: Float32Array, middles: Float64Array) -> IndexArray:
-    """[h, w] number of the middle that is nearest to each block's vote."""
-    rows, columns = np.mgrid[0 : offsets.shape[1], 0 : offsets.shape[2]].astype(np.float32)
-    votes = (rows + offsets[0], columns + offsets[1])
-    distances = [(votes[0] - np.float32(y)) ** 2 + (votes[1] - np.float32(x)) ** 2 for y, x in middles]
-    return np.asarray(np.argmin(distances, axis=0), dtype=np.intp)
+def _nearest(offsets: Float32Array, middles: Float64Array, rows: IndexArray, columns: IndexArray) -> IndexArray:
+    """[N] number of the middle that is nearest to the vote of the block at each row and column [N]."""
+    y, x = rows + offsets[0, rows, columns], columns + offsets[1, rows, columns]
+    return np.asarray(np.argmin([(y - at_y) ** 2 + (x - at_x) ** 2 for at_y, at_x in middles], axis=0), dtype=np.intp)

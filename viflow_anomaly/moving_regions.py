@@ -150,16 +150,15 @@ def _things(maps: MotionMaps, mask: BoolArray, part: tuple[slice, slice], config
     A faint thing is what reaches ``faint_motion_probability`` and has no more than a speck that is certain; small and
     slow things are no more than that.
     """
+    from skimage.measure import label as label_components  # noqa: PLC0415  # a fifth of a second of start-up
+
     certain = mask & (maps.motion[part] > config.min_motion_probability)
-    things, faint = (_divided(maps, one, part) for one in (certain, mask))
+    origin = (part[0].start, part[1].start)
+    things = things_of_pixels(_labels(certain, maps.seam_logit[part]), maps.offsets, origin)
+    faint = label_components(mask, connectivity=2)  # type: ignore[no-untyped-call]
     is_new = np.bincount(faint[certain], minlength=int(faint.max()) + 1) < config.min_area_fraction * maps.motion.size
     is_new[0] = False
     return np.where(is_new[faint], faint + things.max(), things)
-
-
-def _divided(maps: MotionMaps, mask: BoolArray, part: tuple[slice, slice]) -> LabelArray:
-    """[h, w] things (1..) of a mask over a part of the image."""
-    return things_of_pixels(_labels(mask, maps.seam_logit[part]), maps.offsets, (part[0].start, part[1].start))
 
 
 def _labels(mask: BoolArray, seam_logit: Float32Array) -> LabelArray:

@@ -49,9 +49,9 @@ def test_logit_blocks_are_shuffled_as_the_head_does() -> None:
     np.testing.assert_array_equal(read_logit_blocks(blocks), pixels)
 
 
-def answer(model: Any, cues: dict[str, Float32Array]) -> Float32Array:
+def answer(model: Any, cues: dict[str, Float32Array], output: str) -> Float32Array:
     compiled = openvino.Core().compile_model(model, "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
-    return np.asarray(compiled({name: values[None] for name, values in cues.items()})[0][0])
+    return np.asarray(compiled({name: values[None] for name, values in cues.items()})[output][0])
 
 
 def bundled() -> Any:
@@ -68,8 +68,10 @@ def test_the_bundled_head_by_blocks_says_the_same() -> None:
     cues = {"photometric": noise(3, HEIGHT, WIDTH), "geometric": noise(geometric, ROWS, COLUMNS)}
     written = np.zeros((ROWS, COLUMNS, channels), dtype=np.float32)
     write_cue_blocks(cues["photometric"], cues["geometric"], written)
-    by_pixels = answer(plain, cues)
-    np.testing.assert_allclose(read_logit_blocks(answer(blocks, {CUES: written})), by_pixels, atol=1e-4)
+    by_pixels = answer(plain, cues, "logits")
+    np.testing.assert_allclose(read_logit_blocks(answer(blocks, {CUES: written}, LOGITS)), by_pixels, atol=1e-4)
+    offsets = (answer(plain, cues, "offsets"), answer(blocks, {CUES: written}, "offsets"))
+    np.testing.assert_allclose(*offsets, atol=1e-4)
     assert np.abs(by_pixels).max() > 1
 
 
