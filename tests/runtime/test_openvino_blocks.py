@@ -82,8 +82,8 @@ def test_channels_are_padded_with_weights_of_zero() -> None:
     cues = {"photometric": noise(3, HEIGHT, WIDTH), "geometric": noise(13, ROWS, COLUMNS)}
     written = np.full((ROWS, COLUMNS, 64), 1e3, dtype=np.float32)
     write_cue_blocks(cues["photometric"], cues["geometric"], written)
-    plain = answer(drawn_head(geometric=13), cues)
-    np.testing.assert_allclose(read_logit_blocks(answer(model, {CUES: written})), plain, atol=1e-4)
+    plain = answer(drawn_head(geometric=13), cues, "logits")
+    np.testing.assert_allclose(read_logit_blocks(answer(model, {CUES: written}, LOGITS)), plain, atol=1e-4)
 
 
 def test_a_head_of_another_build_stays_as_it_is() -> None:
