@@ -31,6 +31,8 @@ HALF_TEXTURE_GRAY2 = 8.0
 MIN_SHIFT_PX = 0.5
 """A common motion is worth moving the coordinates by, where its root mean square over the blocks is this much."""
 MIN_HALVED_SIDE_PX = 64
+MIN_STEP_PX = 1.5
+"""Source pixels for one view pixel: halves of an image show more than the view does only where it is coarser still."""
 NEIGHBOURHOOD = 1 / 8
 """Side of what is corrected in depth as a whole, in image widths: a smaller thing cannot explain itself away."""
 DEPTH_ROUNDS = 3
@@ -97,7 +99,8 @@ def align(pair: FramePair, model_input: ModelInput, predicted: PredictedFlow, *,
     coordinates = view.target_coordinates(predicted.flow_px, predicted.stride)
     geometry = block_geometry(predicted, view, focal_px)
     as_predicted = Alignment(coordinates, geometry, np.zeros_like(geometry.log_ratio))
-    if geometry.points is None or min(pair.source.image.shape) < MIN_HALVED_SIDE_PX:
+    small = min(pair.source.image.shape) < MIN_HALVED_SIDE_PX or max(view.step_px) < MIN_STEP_PX
+    if geometry.points is None or small:
         return as_predicted
     common = _common(*_remaining_of_halves(pair, coordinates, geometry), geometry)
     if common is None or _root_mean_square(common.flow_px) < MIN_SHIFT_PX:
