@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,5 +49,11 @@ def test_a_lens_bends_the_corners_and_leaves_the_middle(pair: FramePair) -> None
     assert difference[middle].max() <= 2
     assert difference[:8, :8].mean() > difference[middle].mean()
     assert bent.source.timestamp_ns == pair.source.timestamp_ns
+    grid = np.add.outer(np.arange(height), np.arange(width)).astype(np.uint8)  # a pixel further along x is one brighter
+    ramp = replace(pair, source=replace(pair.source, image=np.broadcast_to(grid[0] // 2, (height, width)).copy()))
+    diagonal = float(np.hypot(width - 1, height - 1))
+    expected = -0.01 * diagonal * (width - 1) / diagonal / 2  # outwards, along x alone, half a gray level a pixel
+    seen = bend_lens(ramp, by=-0.01).source.image.astype(float) - ramp.source.image
+    assert seen[0, 0] == pytest.approx(-expected, abs=1.0)
     same = bend_lens(pair, by=0.0)
     np.testing.assert_array_equal(same.target.image, pair.target.image)

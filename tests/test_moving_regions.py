@@ -75,6 +75,7 @@ def test_a_faint_thing_is_found_beside_a_certain_one_and_not_around_it() -> None
     assert faint.bbox == (80, 60, 30, 20)
     assert (certain.label, faint.label) == ("independent_motion", "model_error")
     assert faint.score == pytest.approx(0.3, abs=1e-3)
+    assert [region.evidence["min_probability"] for region in (certain, faint)] == [0.5, 0.15]
     assert len(regions_of(drawn, RegionConfig(faint_motion_probability=0.5))) == 1
 
 
@@ -85,6 +86,15 @@ def test_two_that_touch_are_cut_along_their_seam() -> None:
     assert left.bbox == (30, 20, 30, 30)
     assert right.bbox == (60, 20, 30, 30)
     assert left.area_px + right.area_px == 1800
+
+
+def test_two_that_touch_are_divided_by_their_middles() -> None:
+    drawn = maps((slice(16, 48), slice(24, 88)))
+    rows, columns = np.mgrid[0 : SHAPE[0] // 4, 0 : SHAPE[1] // 4].astype(np.float32)
+    middle = np.where(columns < 14, 9.5, 17.5)
+    drawn = drawn._replace(offsets=np.stack([7.5 - rows, middle - columns]).astype(np.float32))
+    boxes = sorted(region.bbox for region in regions_of(drawn))
+    assert boxes == [(24, 16, 32, 32), (56, 16, 32, 32)]
 
 
 def test_what_is_nothing_but_seam_is_no_region() -> None:

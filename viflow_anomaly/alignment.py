@@ -1,4 +1,4 @@
-"""A pair's explanation once more at the image's own resolution, until nothing is left that the static world explains.
+"""The predicted coordinates once more on halved images, and what the static world explains of the flow then left.
 
 The network's view may be several times coarser than the image; a third of a pixel there is two pixels here, and every
 edge differs. The flow that remains between source and reconstruction says which small motion of the camera is missing
@@ -18,10 +18,11 @@ from viflow_anomaly.block_geometry import BlockGeometry, block_geometry, padded
 from viflow_anomaly.config import EVIDENCE_BLOCK_PX
 from viflow_anomaly.explanation import Explanation
 from viflow_anomaly.geometry import Float32Array, sample_bilinear
-from viflow_anomaly.measured_flow import RemainingFlow, measure_remaining_flow
+from viflow_anomaly.measured_flow import RemainingFlow, measure_coarse_flow, measure_remaining_flow
 from viflow_anomaly.model_input import ModelInput
 from viflow_anomaly.motion_refinement import common_motion_px
 from viflow_anomaly.prediction import PredictedFlow
+from viflow_anomaly.regions import BoolArray
 from viflow_anomaly.sensor_data import FramePair, Uint8Array
 
 NO_GRAY = np.zeros(4)
@@ -32,7 +33,7 @@ MIN_SHIFT_PX = 0.5
 """A common motion is worth moving the coordinates by, where its root mean square over the blocks is this much."""
 MIN_HALVED_SIDE_PX = 64
 MIN_STEP_PX = 1.5
-"""Source pixels for one view pixel: halves of an image show more than the view does only where it is coarser still."""
+"""Source pixels for one view pixel; with fewer, halves of the image hardly show more than the view did."""
 NEIGHBOURHOOD = 1 / 8
 """Side of what is corrected in depth as a whole, in image widths: a smaller thing cannot explain itself away."""
 DEPTH_ROUNDS = 3
@@ -99,10 +100,10 @@ def align(pair: FramePair, model_input: ModelInput, predicted: PredictedFlow, *,
     coordinates = view.target_coordinates(predicted.flow_px, predicted.stride)
     geometry = block_geometry(predicted, view, focal_px)
     as_predicted = Alignment(coordinates, geometry, np.zeros_like(geometry.log_ratio))
-    small = min(pair.source.image.shape) < MIN_HALVED_SIDE_PX or max(view.step_px) < MIN_STEP_PX
-    if geometry.points is None or small:
+    shows_no_more = min(pair.source.image.shape) < MIN_HALVED_SIDE_PX or max(view.step_px) < MIN_STEP_PX
+    if geometry.points is None or shows_no_more:
         return as_predicted
-    common = _common(*_remaining_of_halves(pair, coordinates, geometry), geometry)
+    common = _common(*_remaining_of_halves(pair, coordinates, view.analyzed(), geometry), geometry)
     if common is None or _root_mean_square(common.flow_px) < MIN_SHIFT_PX:
         return as_predicted
     height, width = pair.source.image.shape
@@ -119,7 +120,7 @@ def remaining_evidence(explained: Explanation, alignment: Alignment) -> AlignedP
     np.copyto(rebuilt, source, where=inside == 0)
     inside_share = _shares(inside, geometry)
     remaining, log_depth = measure_remaining_flow(source, rebuilt, block_px=EVIDENCE_BLOCK_PX), alignment.log_depth
-    common = _common(remaining, inside_share, geometry)
+    common = _common(remaining.flow_px, remaining.texture_gray2, inside_share, geometry)
     if common is not None:
         flow_px, local_px = remaining.flow_px - common.flow_px, remaining.local_flow_px - common.flow_px
         remaining = remaining._replace(flow_px=flow_px, local_flow_px=local_px)
@@ -128,9 +129,14 @@ def remaining_evidence(explained: Explanation, alignment: Alignment) -> AlignedP
 
 
 def _remaining_of_halves(
-    pair: FramePair, coordinates: Float32Array, geometry: BlockGeometry
-) -> tuple[RemainingFlow, Float32Array]:
-    """A first look at a quarter of the pixels, brought to the blocks of the whole image; and what share is inside."""
+    pair: FramePair, coordinates: Float32Array, analyzed: BoolArray | None, geometry: BlockGeometry
+) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """A first look at a quarter of the pixels: flow [h, w, 2] in pixels of the whole image, texture to measure it by,
+    and what share of each of its blocks can be compared.
+
+    Exposures are not compensated: the search takes means off, and a gain leaves less than ``MIN_SHIFT_PX``.
+    """
+    height, width = pair.source.image.shape
     source, target = (padded(frame.image) for frame in (pair.source, pair.target))
     halves = (source.shape[1] // 2, source.shape[0] // 2)
     source, target = (
@@ -139,18 +145,19 @@ def _remaining_of_halves(
     )
     at = cv2.resize(padded(coordinates), halves, interpolation=cv2.INTER_AREA)
     at = (at - np.float32(0.5)) * np.float32(0.5)
-    inside = cv2.inRange(at, (0.0, 0.0), ((pair.target.image.shape[1] - 1) / 2, (pair.target.image.shape[0] - 1) / 2))
+    reached = cv2.inRange(at, (-0.25, -0.25), ((width - 1.5) / 2, (height - 1.5) / 2))
+    shown = np.ones((height, width), np.uint8) if analyzed is None else analyzed.view(np.uint8)
+    shown_halves = cv2.resize(padded(shown, outside=True), halves, interpolation=cv2.INTER_NEAREST)
+    inside = np.asarray(np.minimum(reached, shown_halves), dtype=np.uint8)
     rebuilt = np.asarray(sample_bilinear(target, at), dtype=np.uint8)
     np.copyto(rebuilt, source, where=inside == 0)
-    halved = measure_remaining_flow(source, rebuilt, block_px=EVIDENCE_BLOCK_PX)
+    flow_px, texture = measure_coarse_flow(source, rebuilt, block_px=EVIDENCE_BLOCK_PX)
     blocks = geometry.log_ratio.shape[::-1]
-    flow_px, local_px, mismatch, texture = (
+    flow_px, texture = (
         np.asarray(cv2.resize(one, blocks, interpolation=cv2.INTER_LINEAR), dtype=np.float32)
-        for one in (halved.flow_px * np.float32(2), halved.local_flow_px * np.float32(2), *halved[1:3])
+        for one in (flow_px * np.float32(2), texture)
     )
-    return RemainingFlow(flow_px, mismatch, texture, local_px), _shares(
-        np.asarray(inside // 255, dtype=np.uint8), geometry
-    )
+    return flow_px, texture, _shares(inside, geometry)
 
 
 def _shares(inside: Uint8Array, geometry: BlockGeometry) -> Float32Array:
@@ -159,15 +166,17 @@ def _shares(inside: Uint8Array, geometry: BlockGeometry) -> Float32Array:
     return np.asarray(cv2.resize(inside * np.float32(1), blocks, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
-def _common(remaining: RemainingFlow, inside_share: Float32Array, geometry: BlockGeometry) -> _Common | None:
+def _common(
+    flow_px: Float32Array, texture_gray2: Float32Array, inside_share: Float32Array, geometry: BlockGeometry
+) -> _Common | None:
     """None where the network gives flow only, and no static world can be told from anything else."""
     if geometry.points is None:
         return None
-    texture = np.maximum(remaining.texture_gray2, 0)
+    texture = np.maximum(texture_gray2, 0)
     trust = np.asarray(texture / (texture + HALF_TEXTURE_GRAY2) * inside_share, dtype=np.float32)
     line = geometry.line
-    moved = common_motion_px(remaining.flow_px, trust, geometry.points, line, geometry.focal_px)
-    left = remaining.flow_px - moved
+    moved = common_motion_px(flow_px, trust, geometry.points, line, geometry.focal_px)
+    left = flow_px - moved
     along = left[..., 0] * line.x + left[..., 1] * line.y
     log_depth = _neighbourhood_log_depth(along, trust, line.parallax_px)
     nearer = log_depth * line.parallax_px

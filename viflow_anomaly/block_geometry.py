@@ -23,7 +23,7 @@ MIN_INVERSE_DEPTH = 1e-3
 
 
 class BlockGeometry(NamedTuple):
-    """Of the padded image's blocks [h, w]; zeros where the network gives flow only.
+    """Of the padded image's blocks [h, w]; zeros (lines along x) where the network gives flow only.
 
     Attributes:
         line: epipolar lines, in source pixels.

@@ -206,9 +206,10 @@ ShapeRuleName = Literal["axis_aligned", "thickness", "oriented", "none"]
 class RegionConfig(FrozenConfig):
     """From evidence to labelled regions; see ``regions`` and ``moving_regions`` for each step.
 
-    Fractions are of the image diagonal unless the name says otherwise; the residual is in gray levels 0-255. Regions of
-    learned evidence (``moving_regions``) know ``min_motion_probability`` in place of ``threshold_mads``,
-    ``min_residual_gray``, smoothing, opening and closing.
+    Fractions are of the image diagonal unless the name says otherwise; the residual is in gray levels 0-255.
+    Regions of learned evidence (``moving_regions``) know ``min_motion_probability`` and
+    ``faint_motion_probability`` in place of ``threshold_mads``, ``min_residual_gray``, smoothing, opening and
+    closing.
     """
 
     texture_softening_gray: float = Field(
@@ -333,6 +334,8 @@ class DetectorConfig(FrozenConfig):
 
 EVIDENCE_BLOCK_PX = 4
 """Sides of the blocks of pixels that geometric cues are on, and at which the evidence head works."""
+MAX_OFFSET_BLOCKS = 127
+"""How far the middle of a thing may be from one of its blocks, in blocks."""
 
 
 Channels = Annotated[int, Field(ge=1, le=1024)]

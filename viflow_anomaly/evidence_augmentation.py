@@ -32,7 +32,7 @@ TIME_OFFSET_SIGMA_S = 0.004
 MOUNTING_SIGMA_RAD = math.radians(0.5)
 FOCAL_SIGMA = 0.01
 LENS_SIGMA = 0.0025
-"""Of the error of the lens at the image's corners, in image widths."""
+"""Of the error of the lens at the image's corners, in image diagonals."""
 MIN_CONTRAST, MAX_CONTRAST = 0.35, 2.4
 MAX_PIVOT_GRAY = 60.0
 MAX_BLUR_PX, MAX_NOISE_GRAY = 1.2, 3.0
@@ -92,7 +92,10 @@ def change_contrast(pair: FramePair, *, factor: float, pivot_gray: float) -> Fra
 
 
 def bend_lens(pair: FramePair, *, by: float) -> FramePair:
-    """Both images as through a lens whose distortion is off by so many image widths at the corners."""
+    """Both images as through a lens whose distortion is off by so many image diagonals at the corners.
+
+    Labels stay where they were: there, they are off by as much.
+    """
     height, width = pair.source.image.shape
     middle = np.array([(width - 1) / 2, (height - 1) / 2], dtype=np.float32)
     offsets = pixel_grid(height, width) - middle

@@ -4,9 +4,10 @@ None of the cues is the picture itself. The head learns on simulated scenes; wha
 like there. All cues are bounded to -1..1, so that nothing unheard of reaches the network from a real camera.
 
 Photometric cues are on every source pixel, geometric ones on blocks of 4x4: flow is smooth, and the measured one is no
-finer. Of the flow that is left between source and reconstruction, what one small motion of the camera explains is taken
-off (``motion_refinement``). Of the rest, only what lies *across* the epipolar line is independent motion for sure;
-*along* it, a wrong depth looks the same. Lines and parallax are those of a pinhole camera; a lens bends them a little.
+finer. Of the flow that is left between source and reconstruction, what one small motion of the camera and whole
+neighbourhoods' depth explain is taken off (``alignment``). Of the rest, only what lies *across* the epipolar line is
+independent motion for sure; *along* it, a wrong depth looks the same. Lines and parallax are those of a pinhole camera;
+a lens bends them a little.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ GEOMETRIC_CUES = (
     "remaining depth",
 )
 CUES_VERSION = 2
-"""Raised with every change of their arithmetic: a head must judge the cues that it has learned from."""
+"""Raised when a head that was trained before must not judge them; kept cues are made anew then. Delete them after any
+smaller change of their arithmetic."""
 HALF_GRAY, HALF_NORMALISED_GRAY, HALF_MISMATCH_GRAY = 16.0, 8.0, 8.0
 HALF_LOG_DEPTH, SURE_PARALLAX_PX = 0.5, 0.25
 HALF_REMAINING_PX, HALF_PARALLAX_PX, HALF_FLOW_PX = 1.0, 4.0, 16.0

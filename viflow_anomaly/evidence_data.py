@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viflow_anomaly.checkpoint_record import write_atomically
-from viflow_anomaly.config import EVIDENCE_BLOCK_PX, EvidenceTrainingConfig
+from viflow_anomaly.config import EVIDENCE_BLOCK_PX, MAX_OFFSET_BLOCKS, EvidenceTrainingConfig
 from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import DatasetError, InvalidInputError
@@ -36,7 +36,6 @@ from viflow_anomaly.sensor_data import Uint8Array
 MOVING, IGNORED, SEAM = 1, 2, 4
 """Bits of ``truth``: a counted mover; what counts neither way; a moving pixel near another moving thing."""
 SEAM_REACH_PX = 3
-MAX_OFFSET_BLOCKS = 127
 BYTE_SCALE = np.float32(127.5)
 TRIES = 3
 """A crop without a mover is drawn anew this often: most of a picture rests."""

@@ -115,14 +115,17 @@ def evidence_loss(
 
 
 def offset_loss(offsets: torch.Tensor, true_offsets: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
-    """Mean absolute error of where things have their middles, over blocks that move, in ``OFFSET_SCALE_BLOCKS``.
+    """Huber loss (knee at a block) of where things have their middles, y plus x, in ``OFFSET_SCALE_BLOCKS``.
+
+    Its mean is over the blocks whose four innermost pixels move, so that a mirror changes nothing.
 
     Args:
         offsets: [B, 2, h, w] in blocks.
         true_offsets: [B, 2, h, w] likewise.
         truth: [B, H, W] uint8 bits.
     """
-    middle = EVIDENCE_BLOCK_PX // 2
-    moving = ((truth[:, middle::EVIDENCE_BLOCK_PX, middle::EVIDENCE_BLOCK_PX] & MOVING) != 0).float()
+    size, middle = EVIDENCE_BLOCK_PX, EVIDENCE_BLOCK_PX // 2
+    four = [truth[:, middle - down :: size, middle - right :: size] for down in (0, 1) for right in (0, 1)]
+    moving = ((four[0] & four[1] & four[2] & four[3] & MOVING) != 0).float()
     error = F.smooth_l1_loss(offsets, true_offsets.float(), reduction="none").sum(dim=1) / OFFSET_SCALE_BLOCKS
     return (error * moving).sum() / moving.sum().clamp(min=1)

@@ -72,14 +72,7 @@ def things_of_pixels(labels: LabelArray, offsets: Float32Array, origin: tuple[in
             continue
         if things is labels:
             things = labels.copy()
-        low = [int(one.min()) - 1 for one in (rows, columns)]
-        high = [int(one.max()) + 2 for one in (rows, columns)]
-        part = tuple(
-            slice(max(0, EVIDENCE_BLOCK_PX * below - start), max(0, EVIDENCE_BLOCK_PX * above - start))
-            for below, above, start in zip(low, high, origin, strict=True)
-        )
-        y, x = np.nonzero(labels[part] == number)
-        y, x = y + part[0].start, x + part[1].start
+        y, x = np.nonzero(labels == number)
         thing = _nearest(offsets, middles, (y + origin[0]) // EVIDENCE_BLOCK_PX, (x + origin[1]) // EVIDENCE_BLOCK_PX)
         things[y, x] = np.where(thing == 0, number, made + thing)
         made += len(middles) - 1

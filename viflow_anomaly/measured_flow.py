@@ -151,19 +151,37 @@ def measure_remaining_flow(source: Uint8Array, rebuilt: Uint8Array, *, block_px:
     height, width = source.shape[0] // 2, source.shape[1] // 2
     blocks = (source.shape[1] // block_px, source.shape[0] // block_px)
     small_source, small_rebuilt = (_halved(image) for image in (source, rebuilt))
-    # The search's own pyramid begins with the same halves: this is its flow before it is doubled in size, bilinearly;
-    # what follows is what the doubled one would say of every second pixel, and on average of each block.
-    half_px = np.asarray(_fast_search(finest_scale=0).calc(small_source, small_rebuilt, None), dtype=np.float32)
+    half_px = _flow_of_halves(small_source, small_rebuilt)
     start_px = _filtered(half_px, FIRST_OF_DOUBLED)
     at_px = start_px + cached_pixel_grid(height, width)
-    mean_px = cv2.resize(_filtered(half_px, MEAN_OF_DOUBLED), blocks, interpolation=cv2.INTER_AREA)
-    flow_px = np.multiply(mean_px, np.float32(2), out=mean_px)
     return RemainingFlow(
-        flow_px,
+        _doubled_on_blocks(half_px, blocks),
         _mismatch_gray(small_source, small_rebuilt, at_px, blocks),
         _texture(small_source, blocks),
         _local_flow(small_source, small_rebuilt, start_px, at_px, blocks),
     )
+
+
+def measure_coarse_flow(source: Uint8Array, rebuilt: Uint8Array, *, block_px: int) -> tuple[Float32Array, Float32Array]:
+    """``flow_px`` and ``texture_gray2`` of ``measure_remaining_flow``, and nothing else."""
+    blocks = (source.shape[1] // block_px, source.shape[0] // block_px)
+    small_source, small_rebuilt = (_halved(image) for image in (source, rebuilt))
+    return _doubled_on_blocks(_flow_of_halves(small_source, small_rebuilt), blocks), _texture(small_source, blocks)
+
+
+def _flow_of_halves(small_source: Uint8Array, small_rebuilt: Uint8Array) -> Float32Array:
+    """[h, w, 2] in halved pixels. The search's own pyramid begins with the same halves: this is its flow before it is
+    doubled in size, bilinearly; what follows is what the doubled one would say of every second pixel, and on average of
+    each block."""
+    return np.asarray(_fast_search(finest_scale=0).calc(small_source, small_rebuilt, None), dtype=np.float32)
+
+
+def _doubled_on_blocks(half_px: Float32Array, blocks: tuple[int, int]) -> Float32Array:
+    """[h, w, 2] in whole pixels."""
+    mean_px = np.asarray(
+        cv2.resize(_filtered(half_px, MEAN_OF_DOUBLED), blocks, interpolation=cv2.INTER_AREA), np.float32
+    )
+    return np.multiply(mean_px, np.float32(2), out=mean_px)
 
 
 def _filtered(flow_px: Float32Array, taps: Float32Array) -> Any:

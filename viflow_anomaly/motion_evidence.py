@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from viflow_anomaly.checkpoint_record import EvidenceRecord
-from viflow_anomaly.config import DetectorConfig
+from viflow_anomaly.config import MAX_OFFSET_BLOCKS, DetectorConfig
 from viflow_anomaly.errors import CheckpointError
 from viflow_anomaly.evidence_cues import CUES_VERSION, GEOMETRIC_CUES, PHOTOMETRIC_CUES, EvidenceCues
 from viflow_anomaly.explanation import Explanation
@@ -62,7 +62,8 @@ def judge_cues(head: LoadedEvidence, cues: EvidenceCues, explanation: Explanatio
     height, width = explanation.source.shape
     answer = head.runtime.judge(*cues)
     logits = answer.logits[:, :height, :width]
-    return JudgedCues(cues, MotionMaps(sigmoid(np.ascontiguousarray(logits[0])), logits[1], answer.offsets))
+    offsets = np.clip(answer.offsets, -MAX_OFFSET_BLOCKS, MAX_OFFSET_BLOCKS)
+    return JudgedCues(cues, MotionMaps(sigmoid(np.ascontiguousarray(logits[0])), logits[1], offsets))
 
 
 def regions_of(

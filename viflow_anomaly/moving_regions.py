@@ -148,7 +148,7 @@ def _things(maps: MotionMaps, mask: BoolArray, part: tuple[slice, slice], config
     """[h, w] things (1..) in a part of the image: those that somewhere probably move, divided, and the faint ones.
 
     A faint thing is what reaches ``faint_motion_probability`` and has no more than a speck that is certain; small and
-    slow things are no more than that.
+    slow things are no more than that. It is neither cut along seams nor divided.
     """
     from skimage.measure import label as label_components  # noqa: PLC0415  # a fifth of a second of start-up
 
@@ -222,10 +222,13 @@ def _evidence(features: Float64Array, shape: Shape, ratio: float, config: Region
             ("parallax", HALF_PARALLAX_PX),
         )
     )
+    probability, needed = 1 / (1 + float(np.exp(-features[0]))), config.min_motion_probability
+    if probability <= needed:  # a faint thing
+        needed = min(needed, config.faint_motion_probability)
     return {
         "rule": shape.verdict,
-        "probability": 1 / (1 + float(np.exp(-features[0]))),
-        "min_probability": config.min_motion_probability,
+        "probability": probability,
+        "min_probability": needed,
         "fill_ratio": float(features[3]),
         "aspect_ratio": max(ratio, 1 / ratio),
         "across_epipolar_px": across,
