@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from viflow_anomaly.pair_detector import PairDetector
+from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.problems import Problem
 
 logger = logging.getLogger(__name__)
@@ -18,11 +19,15 @@ class DetectorSlot:
 
     Args:
         load: makes the detector; called once.
+        metrics: told which model it is, once it is there.
         on_failure: told when it could not be made; the slot then stays empty.
     """
 
-    def __init__(self, load: Callable[[], PairDetector], *, on_failure: Callable[[Exception], Any]) -> None:
+    def __init__(
+        self, load: Callable[[], PairDetector], *, metrics: ServiceMetrics, on_failure: Callable[[Exception], Any]
+    ) -> None:
         self._load = load
+        self._metrics = metrics
         self._on_failure = on_failure
         self._detector: PairDetector | None = None
         self._failed = False
@@ -41,6 +46,7 @@ class DetectorSlot:
             self._on_failure(err)
         else:
             model = self._detector.model_info
+            self._metrics.observe_model(model)
             logger.info("model_loaded", extra={"model": model.name, "model_version": model.version})
 
     def require(self) -> PairDetector:

@@ -136,6 +136,12 @@ VERSION_RESPONSES: Final[Responses] = {
         {"version": "0.1.0", "schema_version": "1.0", "model": EXAMPLE_DETECTION["model"]},
     )
 }
+METRICS_RESPONSES: Final[Responses] = {
+    200: {
+        "description": "Prometheus' text format, or OpenMetrics where the client accepts it",
+        "content": {"text/plain": {"schema": {"type": "string"}}},
+    }
+}
 SCHEMA_RESPONSES: Final[Responses] = {
     200: {"description": "JSON Schema", "content": {"application/schema+json": {"schema": {"type": "object"}}}}
 }

@@ -40,6 +40,7 @@ ENVIRONMENT_PREFIX = "VIFLOW_"
 SERVICE_SETTINGS = (
     "host",
     "port",
+    "workers",
     "max_image_bytes",
     "max_image_pixels",
     "max_body_bytes",
@@ -49,9 +50,12 @@ SERVICE_SETTINGS = (
     "queue_timeout_s",
     "body_timeout_s",
     "shutdown_timeout_s",
+    "warm_up_sizes",
     "log_level",
 )
 """What the service alone takes and checks. It is built on the library, which cannot ask it; a test compares the two."""
+SERVICE_TABLE = "service"
+"""The table of a configuration file that holds them; the other commands pass it over."""
 TEST_SETTINGS = ("real_data",)
 SERVICE_LINK = re.compile(r"VIFLOW_ANOMALY(_\w+)?_(SERVICE_(HOST|PORT)(_\w+)?|PORT(_\d+_\w+)?)")
 """What Kubernetes puts into the environment of every container beside a service called ``viflow-anomaly``."""
@@ -109,7 +113,9 @@ def resolve_settings(
     given = {key: value for key, value in (options or {}).items() if value is not None}
     layers = [("defaults", nested((key.split("."), value) for key, value in (defaults or {}).items()))]
     if config_file is not None:
-        layers.append((str(config_file), read_config_file(config_file)))
+        values = read_config_file(config_file)
+        values.pop(SERVICE_TABLE, None)
+        layers.append((str(config_file), values))
     layers.append(("environment", environment_values(environment)))
     layers.append(("--set", assignment_values(assignments)))
     layers.append(("command line", nested((key.split("."), value) for key, value in given.items())))

@@ -11,7 +11,9 @@ from typing import Any
 import pytest
 from service_world import LiveServer, assert_problem, json_request, problem_of
 
-from viflow_anomaly_service.request_log import JsonLineFormatter, RequestLogMiddleware, configure_logging
+from viflow_anomaly_service.json_log import JsonLineFormatter, configure_logging
+from viflow_anomaly_service.metrics import ServiceMetrics
+from viflow_anomaly_service.request_log import RequestLogMiddleware
 
 
 def request_lines(caplog: pytest.LogCaptureFixture, *, expected: int = 2) -> list[dict[str, Any]]:
@@ -100,7 +102,7 @@ def test_other_protocols_pass_through() -> None:
     async def app(scope: Any, receive: Any, send: Any) -> None:
         seen.append(scope["type"])
 
-    asyncio.run(RequestLogMiddleware(app)({"type": "lifespan"}, None, None))  # type: ignore[arg-type]
+    asyncio.run(RequestLogMiddleware(app, ServiceMetrics())({"type": "lifespan"}, None, None))  # type: ignore[arg-type]
     assert seen == ["lifespan"]
 
 
@@ -116,5 +118,5 @@ def test_a_fault_after_the_answer_began_goes_to_the_server() -> None:
 
     scope = {"type": "http", "method": "GET", "path": "/", "headers": []}
     with pytest.raises(RuntimeError, match="late"):
-        asyncio.run(RequestLogMiddleware(app)(scope, None, send))  # type: ignore[arg-type]
+        asyncio.run(RequestLogMiddleware(app, ServiceMetrics())(scope, None, send))  # type: ignore[arg-type]
     assert [message["type"] for message in sent] == ["http.response.start"]

@@ -57,6 +57,7 @@ def test_operation_ids_are_stable(document: dict[str, Any]) -> None:
         ("/healthz", "get"): "healthz",
         ("/readyz", "get"): "readyz",
         ("/version", "get"): "version",
+        ("/metrics", "get"): "metrics",
         ("/schemas/detection-1.0.json", "get"): "detectionSchema",
         ("/detect", "post"): "detect",
     }

@@ -28,7 +28,7 @@ from viflow_anomaly.detection import load_detection_schema, to_json_dict
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples
-from viflow_anomaly_service.app import load_bundled_or_configured
+from viflow_anomaly_service.detector_loading import load_bundled_or_configured
 from viflow_anomaly_service.examples import example_json_request
 from viflow_anomaly_service.settings import load_settings
 
