@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from fastapi import FastAPI
 
+from viflow_anomaly_service.access_control import add_access_control
 from viflow_anomaly_service.admission import AdmissionGate
 from viflow_anomaly_service.detect_endpoint import add_detect
 from viflow_anomaly_service.detector_loading import DetectorLoader, load_bundled_or_configured
@@ -18,6 +19,7 @@ from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.openapi import complete_openapi
 from viflow_anomaly_service.problems import install_problem_handlers
 from viflow_anomaly_service.request_log import RequestLogMiddleware
+from viflow_anomaly_service.security_headers import SecurityHeadersMiddleware
 from viflow_anomaly_service.service_core import ServiceCore
 from viflow_anomaly_service.settings import ServiceSettings, load_settings
 from viflow_anomaly_service.state_endpoints import VERSION, add_state
@@ -62,7 +64,9 @@ def create_app(
         redirect_slashes=False,
     )
     app.state.core = core
+    add_access_control(app, core.settings)
     app.add_middleware(RequestLogMiddleware, metrics=core.metrics)
+    app.add_middleware(SecurityHeadersMiddleware)
     install_problem_handlers(app)
     add_state(app, core)
     add_detect(app, core)

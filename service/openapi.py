@@ -10,6 +10,7 @@ from fastapi import FastAPI
 from pydantic.json_schema import models_json_schema
 
 from viflow_anomaly.detection import load_detection_schema
+from viflow_anomaly_service.access_openapi import REFUSALS, describe_access
 from viflow_anomaly_service.examples import (
     EXAMPLE_DETECTION,
     EXAMPLE_FAULTS,
@@ -66,7 +67,7 @@ def _problems(statuses: Iterable[int]) -> Responses:
     responses: Responses = {}
     for status in statuses:
         code, detail, field = EXAMPLE_FAULTS[status]
-        retry_after_s = 1 if status == HTTPStatus.SERVICE_UNAVAILABLE else None
+        retry_after_s = 1 if status in (HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.TOO_MANY_REQUESTS) else None
         example = Problem(status, code=code, detail=detail, field=field).body(request_id="drone7-000042")
         responses[status] = _answer(HTTPStatus(status).phrase, _reference("Problem"), example, PROBLEM_MEDIA_TYPE)
         if retry_after_s:
@@ -155,6 +156,7 @@ def complete_openapi(app: FastAPI) -> None:
         if app.openapi_schema is None:
             document = derive()
             document.setdefault("components", {}).setdefault("schemas", {}).update(component_schemas())
+            describe_access(document, _problems(REFUSALS))
             # FastAPI drops members that are null, which this example needs (track_id).
             answer = document["paths"]["/detect"]["post"]["responses"]["200"]["content"]["application/json"]
             answer["example"] = EXAMPLE_DETECTION

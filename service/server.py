@@ -15,6 +15,9 @@ import uvicorn
 
 from viflow_anomaly.allocator import keep_freed_memory
 from viflow_anomaly.errors import ConfigError
+from viflow_anomaly_service.access_rules import require_keys_or_loopback
+from viflow_anomaly_service.api_keys import read_key_file
+from viflow_anomaly_service.connection_guard import guarded_protocol
 from viflow_anomaly_service.json_log import configure_logging
 from viflow_anomaly_service.settings import ServiceSettings
 from viflow_anomaly_service.stop_signals import StopSignals
@@ -40,10 +43,14 @@ def run(settings: ServiceSettings, *, load_detector: DetectorLoader | None = Non
         load_detector: the bundled or configured one when not given; called in every serving process.
 
     Raises:
-        ConfigError: ``address_unavailable``, ``workers_unsupported``, ``workers_failed``.
+        ConfigError: ``keys_missing``, ``address_unavailable``, ``workers_unsupported``, ``workers_failed``; the key
+            file cannot be used.
         Exception: what ``load_detector`` raised (``CheckpointError`` for a checkpoint that cannot be used); the
             server has ended by then.
     """
+    require_keys_or_loopback(settings)
+    if settings.key_file is not None:
+        read_key_file(settings.key_file)  # before processes are started that would each fail on it
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     keep_freed_memory()
     configure_logging(settings.log_level)
@@ -78,7 +85,7 @@ def serve(
     app = create_app(settings, load_detector=load_detector or load_bundled_or_configured, on_load_failure=end_server)
     config = uvicorn.Config(
         app,
-        http="h11",
+        http=guarded_protocol(settings),
         ws="none",
         lifespan="on",
         log_config=None,

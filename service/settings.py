@@ -25,6 +25,7 @@ from viflow_anomaly.settings import ENVIRONMENT_PREFIX, SERVICE_SETTINGS, refuse
 
 MEBIBYTE = 1024 * 1024
 MAX_WORKERS: Final = 256
+_ORIGIN: Final = re.compile(r"https?://[A-Za-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-f:]+\](:\d{1,5})?")
 _SIZE: Final = re.compile(r"([1-9]\d{1,4})x([1-9]\d{1,4})")
 
 
@@ -42,6 +43,18 @@ def _sizes(value: Any) -> Any:
     return tuple((int(size[1]), int(size[2])) for size in found if size is not None)
 
 
+def _origins(value: Any) -> Any:
+    """``"https://a.example,https://b.example"`` as texts, each a scheme and a host; anything else as it is."""
+    if not isinstance(value, str):
+        return value
+    found = [text.strip() for text in value.split(",") if text.strip()]
+    for text in found:
+        if not _ORIGIN.fullmatch(text):
+            raise ValueError(f"expected origins such as https://dashboard.example, found {text!r:.80}")
+    return tuple(found)
+
+
+Origins = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_origins)]
 Sizes = Annotated[tuple[tuple[int, int], ...], NoDecode, BeforeValidator(_sizes)]
 
 
@@ -81,6 +94,15 @@ class ServiceSettings(BaseSettings):
     max_queued: NonNegativeInt = Field(default=32, description="requests that may wait or upload beside them")
     queue_timeout_s: PositiveFloat = Field(default=10.0, description="longest wait for a turn")
     body_timeout_s: PositiveFloat = Field(default=30.0, description="longest upload")
+    request_timeout_s: PositiveFloat = Field(default=120.0, description="longest request, from head to last byte")
+    head_timeout_s: PositiveFloat = Field(default=10.0, description="longest wait for a request's head")
+    max_connections: PositiveInt = Field(default=1024, description="open connections of a process")
+    key_file: UsablePath | None = Field(default=None, description="API keys, lines of `viflow-anomaly keys new`")
+    insecure_no_keys: bool = Field(default=False, description="everybody who reaches the service may ask")
+    rate_limit_per_s: PositiveFloat | None = Field(default=None, description="requests a second of one key")
+    rate_limit_burst: PositiveInt = Field(default=20, description="requests of one key at once")
+    daily_quota: PositiveInt | None = Field(default=None, description="detections a day of one key")
+    allowed_origins: Origins = Field(default=(), description="sites whose pages may ask (CORS)")
     shutdown_timeout_s: PositiveInt = Field(default=20, description="time for running requests after SIGTERM")
     warm_up_sizes: Sizes = Field(default=((752, 480),), description="WIDTHxHEIGHT of pairs judged before it is ready")
     log_level: Literal["debug", "info", "warning", "error"] = "info"

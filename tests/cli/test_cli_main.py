@@ -17,7 +17,7 @@ from viflow_anomaly.cli.progress import stderr_progress
 from viflow_anomaly.detection import load_detection_schema
 from viflow_anomaly.errors import CheckpointError
 
-COMMANDS = ("detect", "batch", "benchmark", "calibrate", "simulate", "train", "serve", "schema", "config")
+COMMANDS = ("detect", "batch", "benchmark", "calibrate", "simulate", "train", "serve", "schema", "config", "keys new")
 HEAVY = {"torch", "cv2", "skimage", "mujoco", "fastapi"}
 
 
@@ -28,7 +28,7 @@ def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_help_loads_nothing_heavy() -> None:
-    asked = [["--help"], ["--version"], ["schema"], *([command, "--help"] for command in COMMANDS)]
+    asked = [["--help"], ["--version"], ["schema"], *([*command.split(), "--help"] for command in COMMANDS)]
     code = f"""
 import sys
 from viflow_anomaly.cli.main import run
@@ -56,7 +56,7 @@ def test_a_threshold_is_applied_without_scipy() -> None:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_shows_an_example(ask: Ask, command: str) -> None:
-    answer = ask([command, "--help"])
+    answer = ask([*command.split(), "--help"])
     assert answer.code == 0
     assert "Example" in answer.out
     assert answer.out.count(f"viflow-anomaly {command}") >= 2
@@ -64,7 +64,7 @@ def test_help_shows_an_example(ask: Ask, command: str) -> None:
 
 def test_help_names_every_command(ask: Ask) -> None:
     answer = ask(["--help"])
-    assert all(f" {command} " in answer.out for command in COMMANDS)
+    assert all(f" {command.split()[0]} " in answer.out for command in COMMANDS)
     assert "Exit codes: 0 done" in answer.out
 
 
@@ -275,3 +275,46 @@ def test_serve_refuses_bad_settings(ask: Ask, monkeypatch: pytest.MonkeyPatch) -
     assert ask(["serve", "--port", "70000"]).is_refusal("Invalid value for '--port'")
     monkeypatch.setenv("VIFLOW_MAX_CONCURRENT", "0")
     assert ask(["serve"]).is_refusal("[config_invalid]")
+
+
+# --- keys
+
+
+def test_keys_new_prints_the_line_and_shows_the_key_once(ask: Ask, tmp_path: Path) -> None:
+    from viflow_anomaly_service.api_keys import KeyRing  # noqa: PLC0415
+
+    answer = ask(["keys", "new", "--scope", "detect", "--scope", "read", "--name", "drone7"])
+    assert answer.code == 0
+    (tmp_path / "keys.txt").write_text(answer.out)
+    (shown,) = (word for word in answer.err.split() if word.startswith("vfa_drone7_"))
+    assert shown not in answer.out
+    found = KeyRing(tmp_path / "keys.txt").find(shown)
+    assert found is not None
+    assert found.scopes == {"detect", "read"}
+
+
+def test_keys_new_speaks_json_and_makes_names(ask: Ask) -> None:
+    made = [json.loads(ask(["keys", "new", "--scope", "read", "--json"]).out) for _ in range(2)]
+    assert made[0]["line"].split()[0] != made[1]["line"].split()[0]
+    assert made[0]["key"].startswith(f"vfa_{made[0]['line'].split()[0]}_")
+
+
+def test_keys_new_refuses_an_unknown_scope(ask: Ask) -> None:
+    assert ask(["keys", "new", "--scope", "write"]).is_refusal("expected one or more of detect, read, admin")
+    assert ask(["keys", "new", "--scope", "read", "--name", "A B"]).is_refusal("[key_name_invalid]")
+
+
+def test_serve_hands_keys_over(ask: Ask, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    stand_in(monkeypatch, "viflow_anomaly_service.server", run=asked.append)
+    assert ask(["serve", "--key-file", "keys.txt"]).code == 0
+    assert ask(["serve", "--insecure-no-keys"]).code == 0
+    assert [(settings.key_file, settings.insecure_no_keys) for settings in asked] == [
+        (Path("keys.txt"), False),
+        (None, True),
+    ]
+
+
+def test_serve_explains_why_it_does_not_start_without_keys(ask: Ask) -> None:
+    answer = ask(["serve", "--host", "0.0.0.0", "--port", "0"])  # noqa: S104
+    assert answer.is_refusal("viflow-anomaly keys new --scope detect")

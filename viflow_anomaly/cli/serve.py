@@ -30,6 +30,13 @@ def serve(
     workers: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Processes (default 1), each with its own model and queue.")
     ] = None,
+    key_file: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="API keys: lines of `viflow-anomaly keys new`.")
+    ] = None,
+    insecure_no_keys: Annotated[
+        bool | None,
+        typer.Option("--insecure-no-keys", help="Let everybody ask who can reach an address that is not loopback."),
+    ] = None,
     checkpoint: Checkpoint = None,
     calibration: Calibration = None,
     threads: Threads = None,
@@ -38,14 +45,18 @@ def serve(
     config: ConfigFile = None,
     assignments: Assignments = None,
 ) -> None:
-    """Serve POST /detect, /healthz, /readyz, /version and /metrics over HTTP until SIGINT or SIGTERM.
+    """Serve POST /detect, /healthz, /readyz, /version, /models and /metrics over HTTP until SIGINT or SIGTERM.
+
+    On loopback no key is needed; where other machines can reach the service it starts with a key file only.
 
     Limits and queue lengths are environment variables (VIFLOW_MAX_IMAGE_BYTES, ...) or stand in the configuration
     file's table "service"; docs/service.md lists them.
 
     [bold]Examples[/bold]
 
-      viflow-anomaly serve --host 0.0.0.0 --port 8000
+      viflow-anomaly keys new --scope detect
+
+      viflow-anomaly serve --host 0.0.0.0 --port 8000 --key-file keys.txt
 
       viflow-anomaly serve --workers 4 --config service.toml
     """
@@ -61,6 +72,8 @@ def serve(
             host=host,
             port=port,
             workers=workers,
+            key_file=key_file,
+            insecure_no_keys=insecure_no_keys,
             checkpoint=settings.checkpoint,
             evidence_head=settings.evidence_head,
             precision=settings.precision,
