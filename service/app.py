@@ -16,6 +16,7 @@ from viflow_anomaly_service.detector_loading import DetectorLoader, load_bundled
 from viflow_anomaly_service.detector_pool import DetectorPool
 from viflow_anomaly_service.detector_slot import DetectorSlot
 from viflow_anomaly_service.metrics import ServiceMetrics
+from viflow_anomaly_service.models_endpoint import add_models
 from viflow_anomaly_service.openapi import complete_openapi
 from viflow_anomaly_service.problems import install_problem_handlers
 from viflow_anomaly_service.request_log import RequestLogMiddleware
@@ -69,6 +70,7 @@ def create_app(
     app.add_middleware(SecurityHeadersMiddleware)
     install_problem_handlers(app)
     add_state(app, core)
+    add_models(app, core)
     add_detect(app, core)
     complete_openapi(app)
     return app

@@ -58,6 +58,7 @@ def test_operation_ids_are_stable(document: dict[str, Any]) -> None:
         ("/readyz", "get"): "readyz",
         ("/version", "get"): "version",
         ("/metrics", "get"): "metrics",
+        ("/models", "get"): "models",
         ("/schemas/detection-1.0.json", "get"): "detectionSchema",
         ("/detect", "post"): "detect",
     }
