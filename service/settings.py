@@ -131,8 +131,13 @@ def load_settings(file_values: Mapping[str, Any] | None = None, **overrides: Any
     Raises:
         ConfigError: ``config_invalid`` with the setting at fault, or with a variable that nothing takes.
     """
-    refuse_unknown_variables(os.environ)
     _refuse_other_limits(os.environ)
+    return resolve_service_settings(file_values, **overrides)
+
+
+def resolve_service_settings(file_values: Mapping[str, Any] | None = None, **overrides: Any) -> ServiceSettings:
+    """As ``load_settings``, for a command that serves nothing: the other commands' limits may be set."""
+    refuse_unknown_variables(os.environ)
     given = {name: value for name, value in overrides.items() if value is not None}
     settings = _validated(given, "service settings")
     if file_values:

@@ -119,6 +119,34 @@ def resolve_settings(
     Raises:
         ConfigError: ``config_invalid``, ``config_unreadable``, ``config_format_unknown``, ``assignment_invalid``.
     """
+    layers = _layers(config_file, environment, assignments, options, defaults)
+    merged: Values = {}
+    settings = Settings()
+    for where, values in layers:
+        if values:
+            merged = _merge(merged, values)
+            settings = Settings.from_mapping(merged, where=where)
+    return settings
+
+
+def setting_origins(
+    *, config_file: Path | None = None, environment: Mapping[str, str], assignments: Iterable[str] = ()
+) -> dict[str, str]:
+    """Dotted name of every setting that was set -> the layer whose value holds; raises as ``resolve_settings``."""
+    origins: dict[str, str] = {}
+    for where, values in _layers(config_file, environment, assignments, None, None):
+        origins |= dict.fromkeys(_leaves(values), where)
+    return origins
+
+
+def _layers(
+    config_file: Path | None,
+    environment: Mapping[str, str],
+    assignments: Iterable[str],
+    options: Mapping[str, Any] | None,
+    defaults: Mapping[str, Any] | None,
+) -> list[tuple[str, Values]]:
+    """Where each comes from and what it sets, lowest first."""
     given = {key: value for key, value in (options or {}).items() if value is not None}
     layers = [("defaults", nested((key.split("."), value) for key, value in (defaults or {}).items()))]
     if config_file is not None:
@@ -128,13 +156,15 @@ def resolve_settings(
     layers.append(("environment", environment_values(environment)))
     layers.append(("--set", assignment_values(assignments)))
     layers.append(("command line", nested((key.split("."), value) for key, value in given.items())))
-    merged: Values = {}
-    settings = Settings()
-    for where, values in layers:
-        if values:
-            merged = _merge(merged, values)
-            settings = Settings.from_mapping(merged, where=where)
-    return settings
+    return layers
+
+
+def _leaves(values: Values, above: str = "") -> Iterator[str]:
+    for name, value in values.items():
+        if isinstance(value, dict) and value:
+            yield from _leaves(value, f"{above}{name}.")
+        else:
+            yield above + name
 
 
 def read_config_file(path: Path) -> Values:

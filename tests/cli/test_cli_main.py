@@ -13,6 +13,7 @@ import pytest
 from pair_world import Ask, PairFolder
 
 from viflow_anomaly.cli import main as cli_main
+from viflow_anomaly.cli.configuration import masked
 from viflow_anomaly.cli.progress import stderr_progress
 from viflow_anomaly.detection import load_detection_schema
 from viflow_anomaly.errors import CheckpointError
@@ -100,6 +101,53 @@ def test_config_prints_what_resolves_here(ask: Ask, monkeypatch: pytest.MonkeyPa
 def test_a_misspelt_variable_is_refused(ask: Ask, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
     monkeypatch.setenv("VIFLOW_TRAINING__STEP", "7")
     assert ask([command]).is_refusal("found VIFLOW_TRAINING__STEP; the closest known one is VIFLOW_TRAINING__STEPS")
+
+
+def test_config_shows_the_service_and_where_values_come_from(
+    ask: Ask, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("VIFLOW_PORT", "9001")
+    monkeypatch.setenv("VIFLOW_DETECTOR__REGIONS__MAX_REGIONS", "8")
+    file = tmp_path / "settings.toml"
+    file.write_text("threads = 2\n[detector.regions]\nmax_regions = 3\n[service]\nport = 1\nmax_queued = 5\n")
+    arguments = ["config", "--config", str(file), "--set", "threads=3"]
+    service = json.loads(ask(arguments).out)["service"]
+    assert (service["port"], service["max_queued"], service["host"]) == (9001, 5, "127.0.0.1")
+    assert json.loads(ask([*arguments, "--origins"]).out) == {
+        "detector.regions.max_regions": {"value": 8, "from": "environment"},
+        "service.max_queued": {"value": 5, "from": str(file)},
+        "service.port": {"value": 9001, "from": "environment"},
+        "threads": {"value": 3, "from": "--set"},
+    }
+
+
+def test_config_takes_the_limits_of_the_other_commands(ask: Ask, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VIFLOW_LIMITS__MAX_BYTES", "5000")
+    assert json.loads(ask(["config"]).out)["limits"]["max_bytes"] == 5000
+
+
+def test_what_is_secret_is_masked() -> None:
+    assert masked(
+        {
+            "password": "x",
+            "smtp_token": 7,
+            "no_password": None,
+            "key_file": "keys.txt",
+            "database": "postgresql://viflow:gehe:im@db:5432/x",
+            "dsn": "host=db password=geheim user=u",
+            "plain": "http://me@host/a:b",
+            "list": ["mqtt://a:geheim@h", 1],
+        }
+    ) == {
+        "password": "***",
+        "smtp_token": "***",
+        "no_password": None,
+        "key_file": "keys.txt",
+        "database": "postgresql://viflow:***@db:5432/x",
+        "dsn": "host=db password=*** user=u",
+        "plain": "http://me@host/a:b",
+        "list": ["mqtt://a:***@h", 1],
+    }
 
 
 def test_config_refuses_unknown_keys(ask: Ask) -> None:

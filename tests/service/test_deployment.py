@@ -67,7 +67,9 @@ def test_every_series_and_label_of_a_query_exists(query: str) -> None:
 
 def test_the_dashboard_shows_every_metric_of_the_service() -> None:
     shown = {exposed()[name] for query in queries() for name in re.findall(r"\bviflow_\w+", query)}
-    assert shown == {name for name in exposed().values() if name.startswith("viflow_") and not name.endswith("_created")}
+    assert shown == {
+        name for name in exposed().values() if name.startswith("viflow_") and not name.endswith("_created")
+    }
 
 
 def test_the_panels_do_not_overlap_and_have_ids_of_their_own() -> None:

@@ -68,7 +68,7 @@ def serve(
     server = import_module("viflow_anomaly_service.server")
     server.run(
         service_settings.load_settings(
-            _service_table(config),
+            service_table(config),
             host=host,
             port=port,
             workers=workers,
@@ -87,7 +87,7 @@ def serve(
     )
 
 
-def _service_table(config: Path | None) -> dict[str, Any]:
+def service_table(config: Path | None) -> dict[str, Any]:
     """What the configuration file says to the service alone.
 
     Raises:
