@@ -49,7 +49,7 @@ SERVICE_SETTINGS = (
     "queue_timeout_s",
     "body_timeout_s",
     "shutdown_timeout_s",
-    "warm_up_sizes",
+    "warm_up",
     "log_level",
 )
 """What the service alone takes and checks. It is built on the library, which cannot ask it; a test compares the two."""

@@ -126,7 +126,7 @@ def live_server(
         ready: wait until the detector is there.
         settings: of the service.
     """
-    app = create_app(ServiceSettings(**{"max_concurrent": 2} | settings), load_detector=load_detector)
+    app = create_app(ServiceSettings(**{"max_concurrent": 2, "warm_up": ()} | settings), load_detector=load_detector)
     config = uvicorn.Config(app, port=0, http="h11", ws="none", lifespan="on", log_config=None, access_log=False)
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run)
