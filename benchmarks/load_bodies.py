@@ -1,7 +1,11 @@
-"""Bodies of ``POST /detect`` made of a pair in a folder such as samples/drone: as a form and as JSON."""
+"""Requests of ``POST /detect`` made of a pair in a folder such as samples/drone, as a form or as JSON.
+
+python benchmarks/load_bodies.py --out request.bin    # what load_client.py sends
+"""
 
 from __future__ import annotations
 
+import argparse
 import base64
 import json
 from collections.abc import Callable
@@ -10,6 +14,7 @@ from typing import Any
 
 import cv2
 
+ROOT = Path(__file__).resolve().parents[1]
 BOUNDARY = "viflow-load"
 
 
@@ -54,3 +59,31 @@ BODIES: dict[str, tuple[str, Callable[[dict[str, bytes], dict[str, Any], dict[st
     "json": ("application/json", json_body),
 }
 """Kind of request -> its Content-Type, and how its body is made."""
+
+
+def head(content_type: str, body: bytes) -> bytes:
+    """What stands before the body."""
+    lines = (
+        "POST /detect HTTP/1.1",
+        "Host: localhost",
+        f"Content-Type: {content_type}",
+        f"Content-Length: {len(body)}",
+    )
+    return ("\r\n".join(lines) + "\r\n\r\n").encode()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Write one whole request to a file.")
+    parser.add_argument("--sample", type=Path, default=ROOT / "samples" / "drone", help="a pair as in samples/drone")
+    parser.add_argument("--size", default="720x480", help="WIDTHxHEIGHT of the pair (default 720x480)")
+    parser.add_argument("--body", choices=sorted(BODIES), default="form", help="how it is sent (default form)")
+    parser.add_argument("--out", type=Path, required=True)
+    arguments = parser.parse_args()
+    width, height = (int(side) for side in arguments.size.split("x"))
+    content_type, make_body = BODIES[arguments.body]
+    body = make_body(*request_parts(arguments.sample, width, height))
+    arguments.out.write_bytes(head(content_type, body) + body)
+
+
+if __name__ == "__main__":
+    main()

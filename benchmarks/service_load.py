@@ -29,7 +29,7 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numpy as np
-from load_bodies import BODIES, request_parts
+from load_bodies import BODIES, head, request_parts
 
 from viflow_anomaly.allocator import keep_freed_memory
 from viflow_anomaly.checkpoint_record import source_commit, write_atomically
@@ -249,7 +249,7 @@ def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="The HTTP service under load.")
     parser.add_argument("--sample", type=Path, default=ROOT / "samples" / "drone", help="a pair as in samples/drone")
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "service-load.json")
-    parser.add_argument("--size", default="752x480", help="WIDTHxHEIGHT of the pairs (default 752x480)")
+    parser.add_argument("--size", default="720x480", help="WIDTHxHEIGHT of the pairs (default 720x480)")
     parser.add_argument("--body", choices=sorted(BODIES), default="form", help="how the pairs are sent (default form)")
     parser.add_argument("--workers", type=int, default=1, help="processes of the service (default 1)")
     parser.add_argument("--rounds", type=int, default=5, help="of throughput, each way (default 5)")
@@ -267,7 +267,6 @@ def main() -> None:
     width, height = (int(side) for side in arguments.size.split("x"))
     content_type, make_body = BODIES[arguments.body]
     body = make_body(*request_parts(arguments.sample, width, height))
-    head = f"POST /detect HTTP/1.1\r\nHost: x\r\nContent-Type: {content_type}\r\nContent-Length: {len(body)}\r\n\r\n"
     report: dict[str, Any] = circumstances()
     report |= {
         "width": width,
@@ -278,7 +277,7 @@ def main() -> None:
     }
     pipeline = Pipeline(content_type, body)
     with running_service(arguments.workers) as service:
-        (service.folder / "detect").write_bytes(head.encode() + body)
+        (service.folder / "detect").write_bytes(head(content_type, body) + body)
         twice = 2 * arguments.seconds
         report["throughput"] = throughput(service, pipeline, rounds=arguments.rounds, seconds=arguments.seconds)
         saturation = report["throughput"]["served_pairs_s"]
@@ -286,7 +285,7 @@ def main() -> None:
         report["overload"] = overload(service, saturation, twice, report["half_load"]["p50_ms"])
     if arguments.requests:
         with running_service(arguments.workers) as service:
-            (service.folder / "detect").write_bytes(head.encode() + body)
+            (service.folder / "detect").write_bytes(head(content_type, body) + body)
             report["memory"] = memory(service, requests=arguments.requests)
     report["load_1min_after"] = round(os.getloadavg()[0], 2)
     write_atomically(arguments.out, (json.dumps(report, indent=2) + "\n").encode())

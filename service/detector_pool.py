@@ -129,6 +129,7 @@ class DetectorPool:
             return await job.done
         finally:
             job.abandoned = True
+            job.done.cancel()  # an error that comes now is nobody's, not even the loop's to complain of
             self._withdraw(job)
 
     async def run_everywhere(self, work: Callable[[], None]) -> None:
