@@ -33,7 +33,7 @@ KEY_HEADER: Final = "X-API-Key"
 CHALLENGE: Final = {"WWW-Authenticate": 'Bearer realm="viflow-anomaly"'}
 CORS_HEADERS: Final = ("Authorization", KEY_HEADER, "Content-Type", "X-Request-ID")
 EXPOSED_HEADERS: Final = ("X-Request-ID", "Retry-After")
-_EVENT_STREAM: Final = b"text/event-stream"
+_EVENT_STREAM: Final = "text/event-stream"
 
 
 def add_access_control(app: FastAPI, settings: ServiceSettings) -> None:
@@ -96,7 +96,7 @@ class AccessMiddleware:
                 detail = f"expected a key of scope {needed}, found one of {', '.join(sorted(key.scopes))}"
                 raise Problem(403, code="scope_missing", detail=detail)
         who = _network_of(client) if key is None else f"key:{key.name}"
-        detection = needed == "detect" and method not in SAFE_METHODS
+        detection = needed == "detect" and method == "POST"
         self._limiter.charge(who, self._allowance(key), detection=detection)
 
     def _require_reachable(self, scope: Scope, headers: Headers) -> None:
@@ -160,10 +160,10 @@ async def _refuse(problem: Problem, scope: Scope, receive: Receive, send: Send) 
 
 
 class RequestTimeMiddleware:
-    """Ends a request that takes longer than ``limit_s`` from its head to its last byte, a stream of events excepted.
+    """Ends a request whose answer is not out within ``limit_s`` from its head.
 
-    It is the last word: uploads, turns and answers have limits of their own. What it catches is a client that does not
-    read its answer.
+    It is the last word: uploads and turns have limits of their own. What it catches is a client that does not read its
+    answer. One that comes in parts has ``limit_s`` for each of them; the events of a stream may be far apart.
     """
 
     def __init__(self, app: ASGIApp, limit_s: float) -> None:
@@ -174,15 +174,19 @@ class RequestTimeMiddleware:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        begun = False
+        begun = is_event_stream = False
+        loop = asyncio.get_running_loop()
 
         async def send_watched(message: Message) -> None:
-            nonlocal begun
+            nonlocal begun, is_event_stream
             if message["type"] == "http.response.start":
                 begun = True
-                if Headers(raw=message["headers"]).get("content-type", "").encode().startswith(_EVENT_STREAM):
-                    limit.reschedule(None)
+                is_event_stream = Headers(raw=message["headers"]).get("content-type", "").startswith(_EVENT_STREAM)
+            if message.get("more_body") and not limit.expired():
+                limit.reschedule(loop.time() + self._limit_s)
             await send(message)
+            if is_event_stream and not limit.expired():
+                limit.reschedule(None)
 
         try:
             async with asyncio.timeout(self._limit_s) as limit:

@@ -5,14 +5,16 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Any, Final
 
 from fastapi import FastAPI
 
+from viflow_anomaly.pair_detector import PairDetector
 from viflow_anomaly_service.access_control import add_access_control
 from viflow_anomaly_service.admission import AdmissionGate
 from viflow_anomaly_service.detect_endpoint import add_detect
-from viflow_anomaly_service.detector_loading import DetectorLoader, load_bundled_or_configured
+from viflow_anomaly_service.detector_loading import DetectorLoader, load_bundled_or_configured, warm_up
 from viflow_anomaly_service.detector_pool import DetectorPool
 from viflow_anomaly_service.detector_slot import DetectorSlot
 from viflow_anomaly_service.metrics import ServiceMetrics
@@ -48,8 +50,8 @@ def create_app(
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        tasks = [asyncio.create_task(core.slot.fill()), asyncio.create_task(_watch_memory(core.metrics))]
         core.pool.start()
+        tasks = [asyncio.create_task(core.slot.fill()), asyncio.create_task(_watch_memory(core.metrics))]
         yield
         core.gate.close()
         for task in tasks:
@@ -82,12 +84,20 @@ def _build(
     """The one place where the settings' numbers meet the parts."""
     metrics = ServiceMetrics()
     workers = settings.workers_at_once
+    pool = DetectorPool(workers=workers, metrics=metrics)
+
+    async def warm_up_everywhere(detector: PairDetector) -> None:
+        for camera in settings.warm_up:
+            await pool.run_everywhere(partial(warm_up, detector, camera))
+
     return ServiceCore(
         settings=settings,
         metrics=metrics,
-        slot=DetectorSlot(lambda: load_detector(settings), metrics=metrics, on_failure=on_load_failure),
+        slot=DetectorSlot(
+            lambda: load_detector(settings), prepare=warm_up_everywhere, metrics=metrics, on_failure=on_load_failure
+        ),
         gate=AdmissionGate(places=workers + settings.max_queued, metrics=metrics),
-        pool=DetectorPool(workers=workers, metrics=metrics),
+        pool=pool,
     )
 
 

@@ -59,7 +59,7 @@ SERVICE_SETTINGS = (
     "daily_quota",
     "allowed_origins",
     "shutdown_timeout_s",
-    "warm_up_sizes",
+    "warm_up",
     "log_level",
 )
 """What the service alone takes and checks. It is built on the library, which cannot ask it; a test compares the two."""

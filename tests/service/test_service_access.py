@@ -7,15 +7,17 @@ import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import httpx
 import pytest
 from rule_detector import RuleDetector
-from service_world import LiveServer, assert_problem, json_request, live_server, problem_of
+from service_world import LiveServer, assert_problem, json_request, live_server, problem_of, wait_until
 from serving_process import serving_process
+from starlette.requests import ClientDisconnect
 
-from viflow_anomaly.errors import ConfigError
+from viflow_anomaly.errors import CheckpointError, ConfigError
+from viflow_anomaly_service.access_control import AccessMiddleware, RequestTimeMiddleware
 from viflow_anomaly_service.api_keys import new_key
 from viflow_anomaly_service.app import create_app
 from viflow_anomaly_service.server import run
@@ -287,3 +289,97 @@ def test_a_request_that_takes_too_long_is_ended() -> None:
         assert_problem(response, 503, "request_timeout", None)
         assert response.headers["retry-after"] == "1"
         assert client.get("/healthz").status_code == 200
+
+
+def asgi_request(app: Any, *, limit_s: float) -> list[dict[str, Any]]:
+    """What ``app`` sends behind the time limit."""
+    sent: list[dict[str, Any]] = []
+
+    async def receive() -> dict[str, Any]:
+        await asyncio.sleep(60)
+        raise AssertionError
+
+    async def send(message: Any) -> None:
+        sent.append(dict(message))
+
+    scope = {"type": "http", "method": "GET", "path": "/x", "headers": []}
+    asyncio.run(RequestTimeMiddleware(app, limit_s=limit_s)(scope, receive, send))
+    return sent
+
+
+def parts(content_type: bytes, *, pause_s: float) -> Any:
+    async def app(scope: Any, receive: Any, send: Any) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": [(b"content-type", content_type)]})
+        for _ in range(3):
+            await asyncio.sleep(pause_s)
+            await send({"type": "http.response.body", "body": b"x", "more_body": True})
+        await send({"type": "http.response.body", "body": b"", "more_body": False})
+
+    return app
+
+
+def test_an_answer_in_parts_has_its_time_for_each() -> None:
+    assert len(asgi_request(parts(b"application/x-ndjson", pause_s=0.2), limit_s=0.4)) == 5
+    with pytest.raises(ClientDisconnect):
+        asgi_request(parts(b"application/x-ndjson", pause_s=0.4), limit_s=0.2)
+
+
+def test_the_events_of_a_stream_may_be_far_apart() -> None:
+    assert len(asgi_request(parts(b"text/event-stream; charset=utf-8", pause_s=0.3), limit_s=0.1)) == 5
+
+
+def test_a_fault_that_is_a_timeout_of_its_own_is_not_taken_for_the_limit() -> None:
+    async def app(scope: Any, receive: Any, send: Any) -> None:
+        raise TimeoutError
+
+    with pytest.raises(TimeoutError):
+        asgi_request(app, limit_s=5.0)
+
+
+def test_a_websocket_needs_a_key_before_it_is_accepted(tmp_path: Path) -> None:
+    path, keys = write_keys(tmp_path, drone=("detect", ""), reader=("read", ""))
+    reached: list[str] = []
+
+    async def app(scope: Any, receive: Any, send: Any) -> None:
+        reached.append(scope["viflow_key_name"])
+
+    async def ask(key: str) -> list[dict[str, Any]]:
+        sent: list[dict[str, Any]] = []
+
+        async def send(message: Any) -> None:
+            sent.append(dict(message))
+
+        headers = [(b"x-api-key", key.encode())] if key else []
+        scope = {"type": "websocket", "path": "/streams/1", "headers": headers, "client": ("10.0.0.1", 1)}
+        await AccessMiddleware(app, ServiceSettings(key_file=path))(scope, send, send)
+        return sent
+
+    for key, code in (("", "key_missing"), ("vfa_drone_x", "key_invalid"), (keys["reader"], "scope_missing")):
+        assert asyncio.run(ask(key)) == [{"type": "websocket.close", "code": 1008, "reason": code}]
+    assert asyncio.run(ask(keys["drone"])) == []
+    assert reached == ["drone"]
+
+
+def test_each_of_several_processes_asks_for_keys(tmp_path: Path) -> None:
+    path, keys = write_keys(tmp_path, drone=("detect", ""))
+    with serving_process(host="0.0.0.0", workers=2, key_file=str(path)) as serving:  # noqa: S104
+        pids = set()
+        for _ in range(40):
+            with serving.client() as client:  # a connection of its own: the system deals them out
+                assert client.post("/detect", json=json_request()).status_code == 401
+                assert client.post("/detect", json=json_request(), headers={"X-API-Key": keys["drone"]}).is_success
+            pids = {record["pid"] for record in serving.events("request")}
+            if len(pids) == 2:
+                break
+        assert len(pids) == 2
+
+
+def test_a_model_that_cannot_be_loaded_tells_no_path() -> None:
+    def fail(settings: ServiceSettings) -> RuleDetector:
+        raise CheckpointError("/srv/secret/model.safetensors: broken", code="checkpoint_corrupt")
+
+    with live_server(fail, ready=False) as server:
+        wait_until(lambda: server.client.get("/readyz").json()["code"] == "model_load_failed")
+        for response in (server.client.get("/readyz"), server.client.get("/models"), server.post_json(json_request())):
+            assert_problem(response, 503, "model_load_failed", None)
+            assert "/srv" not in response.text
