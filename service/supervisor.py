@@ -63,6 +63,10 @@ def supervise(settings: ServiceSettings, load_detector: DetectorLoader | None, s
         reserved.bind((host, port))  # holds the address while processes come and go; it does not listen
         log_address(reserved, workers=settings.workers)
         settings = settings.model_copy(update={"host": host, "port": port})
+        if "prometheus_client" in sys.modules:
+            raise AssertionError(
+                "prometheus_client was imported before it could learn that processes share its numbers"
+            )
         os.environ["PROMETHEUS_MULTIPROC_DIR"] = metrics_folder
         if load_detector is None:
             from viflow_anomaly_service.detector_loading import preload  # noqa: PLC0415 - heavy
