@@ -33,5 +33,6 @@ EXPOSE 8000
 STOPSIGNAL SIGTERM
 HEALTHCHECK --interval=30s --timeout=5s --start-period=20s --retries=3 \
     CMD ["python", "-c", "import os, urllib.request as r; r.urlopen('http://127.0.0.1:' + os.environ['VIFLOW_PORT'] + '/healthz', timeout=4)"]
+# It ends with instructions, unless VIFLOW_KEY_FILE names a mounted key file or VIFLOW_INSECURE_NO_KEYS=true is given.
 ENTRYPOINT ["viflow-anomaly"]
 CMD ["serve", "--host", "0.0.0.0"]

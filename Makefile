@@ -1,7 +1,7 @@
 # make demo   a virtual environment of its own, then the main job on the bundled model and the bundled sample
 # make test   the gate: lint, format, strict types, import direction, tests with a branch-coverage floor
 # Others: lint, model and head (simulate, train, measure), evaluate, reproduction (the paper's table), detection-suite,
-# detection-ablations, detection-robustness, thin-structures, benchmark, wheel, clean, distclean. Needs Python >= 3.11, make and git;
+# detection-ablations, detection-robustness, thin-structures, benchmark, wheel, audit (known vulnerabilities), sbom, clean, distclean. Needs Python >= 3.11, make and git;
 # fetches from package indexes only.
 
 SHELL := /bin/bash
@@ -20,6 +20,9 @@ TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 DEMO_SAMPLE ?= samples/drone
 DEMO_OUT ?= demo-output
 COVERAGE_FLOOR ?= 90
+# In an environment of their own, so that neither is part of what it looks at.
+AUDIT := $(VENV)/audit
+AUDIT_TOOLS := pip-audit==2.10.1 cyclonedx-bom==7.5.0
 
 # The recipe of the bundled model: seeds, sizes and steps. Held-out seeds are never trained on.
 MODEL_DIR ?= runs/model
@@ -38,7 +41,7 @@ HELD_OUT_FRAMES ?= 20
 
 .PHONY: demo test lint model head held-out evaluate reproduction detection-suite detection-ablations detection-robustness thin-structures \
   benchmark \
-  wheel clean distclean
+  wheel audit sbom clean distclean
 
 $(VENV)/.torch: constraints.txt
 	@echo 'making $(VENV) with torch (once, some minutes)'
@@ -80,6 +83,21 @@ wheel: $(VENV)/.installed
 	rm -rf build dist
 	$(PIP) wheel --quiet --no-deps --wheel-dir dist .
 	$(BIN)/python .ci/check_wheel.py dist/*.whl
+
+$(AUDIT)/.installed: $(VENV)/.torch
+	$(BIN)/python -m venv $(AUDIT)
+	$(AUDIT)/bin/python -m pip --disable-pip-version-check install --quiet $(AUDIT_TOOLS)
+	@touch $@
+
+# Every pin, against PyPI's list of known vulnerabilities; one that cannot be looked up fails, too.
+audit: $(AUDIT)/.installed
+	$(AUDIT)/bin/pip-audit --strict --progress-spinner off --no-deps --disable-pip --requirement constraints.txt
+
+# What is installed in $(VENV), as CycloneDX.
+sbom: $(AUDIT)/.installed $(VENV)/.installed
+	mkdir -p dist
+	$(AUDIT)/bin/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible \
+	  --output-file dist/sbom.cdx.json $(BIN)/python
 
 model: held-out
 	for rig in drone:10000 car:50000; do \

@@ -1,4 +1,4 @@
-"""How many requests may be inside, and how many of them may compute, at once."""
+"""How many requests may be inside at once, and how they leave when the service ends."""
 
 from __future__ import annotations
 
@@ -6,59 +6,78 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
+from viflow_anomaly_service.metrics import ServiceMetrics, ShedReason
 from viflow_anomaly_service.problems import Problem
 
 
 class AdmissionGate:
-    """Bounds memory (a request's body is read only once it is admitted) and the computing threads.
+    """Bounds memory: a request's body is read only once it is admitted.
 
     Args:
-        max_concurrent: requests that compute at once.
-        max_queued: further requests that may upload or wait for their turn.
-        queue_timeout_s: longest wait for a turn.
+        places: requests inside at once: uploading, waiting for a worker or being judged.
+        metrics: told of who is inside and who was refused.
 
     Attributes:
-        present: requests inside, computing or not.
+        present: requests inside.
+        closed: nobody is admitted any more.
     """
 
-    def __init__(self, *, max_concurrent: int, max_queued: int, queue_timeout_s: float) -> None:
-        self._capacity = max_concurrent + max_queued
-        self.present = 0
-        self._turns = asyncio.Semaphore(max_concurrent)
-        self._queue_timeout_s = queue_timeout_s
+    def __init__(self, *, places: int, metrics: ServiceMetrics) -> None:
+        self._places = places
+        self._metrics = metrics
+        self._limits: set[asyncio.Timeout] = set()
+        self.closed = False
+
+    @property
+    def present(self) -> int:
+        return len(self._limits)
 
     @asynccontextmanager
     async def admitted(self) -> AsyncIterator[None]:
         """Hold one of the places.
 
         Raises:
-            Problem: 503 ``overloaded``.
+            Problem: 503 ``overloaded``; ``shutting_down``, also for a request inside when its time has run out.
         """
-        if self.present >= self._capacity:
-            raise _overloaded(f"all {self._capacity} places are taken")
-        self.present += 1
+        self.require_open()
+        if len(self._limits) >= self._places:
+            raise self.shed("queue_full", f"all {self._places} places are taken")
         try:
-            yield
-        finally:
-            self.present -= 1
+            async with asyncio.timeout(None) as limit:
+                self._limits.add(limit)
+                self._metrics.in_flight.inc()
+                try:
+                    yield
+                finally:
+                    self._limits.remove(limit)
+                    self._metrics.in_flight.dec()
+        except TimeoutError as err:  # only ours: a request's own limits have become problems further in
+            raise self._ending() from err
 
-    @asynccontextmanager
-    async def turn(self) -> AsyncIterator[None]:
-        """Wait for a computing thread and hold it; first come, first served.
+    def require_open(self) -> None:
+        """Nothing, unless the service is ending.
 
         Raises:
-            Problem: 503 ``overloaded`` after the longest wait.
+            Problem: 503 ``shutting_down``.
         """
-        try:
-            async with asyncio.timeout(self._queue_timeout_s):
-                await self._turns.acquire()
-        except TimeoutError as err:
-            raise _overloaded(f"no turn came within {self._queue_timeout_s:g} s") from err
-        try:
-            yield
-        finally:
-            self._turns.release()
+        if self.closed:
+            raise self._ending()
 
+    def close(self) -> None:
+        """Admit nobody any more; who is inside goes on."""
+        self.closed = True
 
-def _overloaded(found: str) -> Problem:
-    return Problem(503, code="overloaded", detail=f"The service is busy: {found}.", retry_after_s=1)
+    def expel(self) -> None:
+        """Whoever is still inside is refused now: an answer, where the end of the process would be none."""
+        now = asyncio.get_running_loop().time()
+        for limit in self._limits:
+            limit.reschedule(now)
+
+    def shed(self, reason: ShedReason, found: str) -> Problem:
+        """Count a refusal and say it."""
+        self._metrics.shed.labels(reason).inc()
+        return Problem(503, code="overloaded", detail=f"The service is busy: {found}.", retry_after_s=1)
+
+    def _ending(self) -> Problem:
+        self._metrics.shed.labels("shutting_down").inc()
+        return Problem(503, code="shutting_down", detail="The service is being shut down.", retry_after_s=1)

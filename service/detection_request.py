@@ -1,10 +1,9 @@
-"""Body bytes -> what the library asks for -> the answer's bytes. Runs in a worker thread, never on the event loop."""
+"""Body bytes -> what the library asks for. Runs in a worker thread, never on the event loop."""
 
 from __future__ import annotations
 
 import base64
 import binascii
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
@@ -14,7 +13,6 @@ from pydantic import ValidationError
 
 from viflow_anomaly.config import DetectorConfig
 from viflow_anomaly.datasets.camera_json import camera_from_mapping
-from viflow_anomaly.detection import to_json
 from viflow_anomaly.errors import InvalidInputError, TooLargeError, ViflowError
 from viflow_anomaly.images import decode_image
 from viflow_anomaly.motor_input import require_supported
@@ -27,6 +25,9 @@ from viflow_anomaly_service.schemas import DetectRequest, ImuPart, RequestRest, 
 from viflow_anomaly_service.settings import ServiceSettings
 
 FORM_PARTS: Final = {"source": True, "target": True, "imu": True, "request": False}  # name -> must be there
+
+BASE64_SLICE: Final = 2**18
+"""Characters decoded at once, a multiple of 4: a call holds up all threads, the event loop's, too, until it returns."""
 
 # The library's field names (left) as the two kinds of request call them.
 _FORM_NAMES: Final = {
@@ -62,33 +63,33 @@ class ReceivedPair:
     options_place: str
 
 
-def answer_request(detector: PairDetector, body: bytes, content_type: str, settings: ServiceSettings) -> bytes:
-    """Detect what one request asks for.
+def read_pair(
+    detector: PairDetector, body: bytes, content_type: str, settings: ServiceSettings
+) -> tuple[FramePair, DetectorConfig, Mapping[str, str]]:
+    """All that one request says.
 
     Args:
-        detector: shared by all threads.
+        detector: whose configuration the request's options change, and whose inputs the pair must have.
         body: the whole body.
         content_type: ``multipart/form-data; boundary=...``, or anything else for JSON.
         settings: limits.
 
     Returns:
-        The detection as UTF-8 JSON.
+        The pair, the configuration that it is to be judged under, and the library's field names as this kind of
+        request calls them.
 
     Raises:
         Problem: whatever is wrong with the request, with its code and field.
     """
-    started = time.perf_counter()
     is_form = content_type.lower().startswith("multipart/")
     received = read_form(body, content_type, settings) if is_form else read_json(body, settings)
     try:
         config = requested_config(received, detector.config)
         pair = frame_pair(received, settings)
         require_supported(pair, detector.motor_source)
-        decode_ms = (time.perf_counter() - started) * 1e3
-        detection = detector.with_config(config).detect(pair, decode_ms=decode_ms)
     except ViflowError as err:
         raise problem_of_error(err, received.field_names) from err
-    return to_json(detection).encode("utf-8")
+    return pair, config, received.field_names
 
 
 def read_json(body: bytes, settings: ServiceSettings) -> ReceivedPair:
@@ -202,8 +203,11 @@ def _validated(shape: type[Wire], value: Any, prefix: str | None = None) -> Wire
 
 
 def _from_base64(text: str, field: str) -> bytes:
+    slices = (text[start : start + BASE64_SLICE] for start in range(0, len(text), BASE64_SLICE))
     try:
-        return base64.b64decode(text, validate=True)
+        if "=" in text[:-2]:  # padding within: the whole says best what is wrong with it
+            return base64.b64decode(text, validate=True)
+        return b"".join(base64.b64decode(part, validate=True) for part in slices)
     except (binascii.Error, ValueError) as err:
         hint = "a data: URL" if text.startswith("data:") else str(err)
         raise Problem(

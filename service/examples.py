@@ -60,6 +60,8 @@ EXAMPLE_DETECTION: Final[dict[str, Any]] = {
 # status -> (code, detail, field): one example of each.
 EXAMPLE_FAULTS: Final[dict[int, tuple[str, str, str | None]]] = {
     400: ("json_invalid", "expected JSON, found: Expecting value at line 1 column 9", None),
+    401: ("key_missing", "expected an API key in 'Authorization: Bearer KEY' or 'X-API-Key: KEY', found none", None),
+    403: ("scope_missing", "expected a key of scope detect, found one of read", None),
     408: ("body_timeout", "expected the whole body within 30 s, found 65536 bytes of it", None),
     413: ("image_too_many_pixels", "source: expected at most 16777216 pixels, found 60000x60000", "source"),
     415: (
@@ -68,6 +70,7 @@ EXAMPLE_FAULTS: Final[dict[int, tuple[str, str, str | None]]] = {
         "target",
     ),
     422: ("image_sizes_differ", "target: expected the source's size 752x480, found 640x480", "target"),
+    429: ("rate_limited", "expected at most 5 requests a second (20 at once), found more", None),
     500: ("internal_error", "The service failed unexpectedly; its log has the request_id.", None),
     503: ("overloaded", "The service is busy: all 34 places are taken.", None),
 }

@@ -10,6 +10,7 @@ from fastapi import FastAPI
 from pydantic.json_schema import models_json_schema
 
 from viflow_anomaly.detection import load_detection_schema
+from viflow_anomaly_service.access_openapi import REFUSALS, describe_access
 from viflow_anomaly_service.examples import (
     EXAMPLE_DETECTION,
     EXAMPLE_FAULTS,
@@ -66,7 +67,7 @@ def _problems(statuses: Iterable[int]) -> Responses:
     responses: Responses = {}
     for status in statuses:
         code, detail, field = EXAMPLE_FAULTS[status]
-        retry_after_s = 1 if status == HTTPStatus.SERVICE_UNAVAILABLE else None
+        retry_after_s = 1 if status in (HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.TOO_MANY_REQUESTS) else None
         example = Problem(status, code=code, detail=detail, field=field).body(request_id="drone7-000042")
         responses[status] = _answer(HTTPStatus(status).phrase, _reference("Problem"), example, PROBLEM_MEDIA_TYPE)
         if retry_after_s:
@@ -136,6 +137,12 @@ VERSION_RESPONSES: Final[Responses] = {
         {"version": "0.1.0", "schema_version": "1.0", "model": EXAMPLE_DETECTION["model"]},
     )
 }
+METRICS_RESPONSES: Final[Responses] = {
+    200: {
+        "description": "Prometheus' text format, or OpenMetrics where the client accepts it",
+        "content": {"text/plain": {"schema": {"type": "string"}}},
+    }
+}
 SCHEMA_RESPONSES: Final[Responses] = {
     200: {"description": "JSON Schema", "content": {"application/schema+json": {"schema": {"type": "object"}}}}
 }
@@ -149,6 +156,7 @@ def complete_openapi(app: FastAPI) -> None:
         if app.openapi_schema is None:
             document = derive()
             document.setdefault("components", {}).setdefault("schemas", {}).update(component_schemas())
+            describe_access(document, _problems(REFUSALS))
             # FastAPI drops members that are null, which this example needs (track_id).
             answer = document["paths"]["/detect"]["post"]["responses"]["200"]["content"]["application/json"]
             answer["example"] = EXAMPLE_DETECTION

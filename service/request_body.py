@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import Final
+from collections.abc import Coroutine
+from typing import Any, Final, TypeVar
 
 from starlette.requests import ClientDisconnect, Request
 
 from viflow_anomaly_service.problems import Problem
 
 DISCARD_SECONDS: Final = 2.0
+
+Result = TypeVar("Result")
 
 
 class RequestBody:
@@ -53,6 +56,28 @@ class RequestBody:
             detail = f"expected the whole body within {timeout_s:g} s, found {size} bytes of it"
             raise Problem(408, code="body_timeout", detail=detail) from err
         return b"".join(chunks)
+
+    async def while_connected(self, work: Coroutine[Any, Any, Result]) -> Result:
+        """The result of ``work``, which is cancelled when the client goes away; only after the whole body was read.
+
+        Raises:
+            ClientDisconnect: the client went away first.
+        """
+        working, leaving = asyncio.ensure_future(work), asyncio.ensure_future(self._left())
+        try:
+            await asyncio.wait({working, leaving}, return_when=asyncio.FIRST_COMPLETED)
+            if not working.done():
+                raise ClientDisconnect
+            return working.result()
+        finally:
+            for task in (working, leaving):
+                task.cancel()
+            # Until the cancelled work has left the line: what holds its place may be given away after that only.
+            await asyncio.wait({working, leaving})
+
+    async def _left(self) -> None:
+        while (await self._request.receive())["type"] != "http.disconnect":
+            pass
 
     async def discard(self) -> None:
         """Swallow the rest for a moment: a client that is still sending would else see a reset, not the answer.

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import re
 import time
 import uuid
+from collections.abc import MutableMapping
 from typing import Any, Final
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.problems import unexpected_problem
 
 logger = logging.getLogger(__name__)
@@ -21,33 +22,23 @@ REQUEST_ID_HEADER: Final = "X-Request-ID"
 CLIENT_CLOSED_REQUEST: Final = 499  # nginx's number for a client that left before its answer
 _ACCEPTED_ID: Final = re.compile(r"[A-Za-z0-9._-]{1,64}", re.ASCII)
 _MAX_LOGGED_PATH: Final = 200
-_STANDARD_ATTRIBUTES: Final = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "color_message"}
 
 
-class JsonLineFormatter(logging.Formatter):
-    """One JSON object a line, ASCII only: a line break in a path or a message cannot forge a second line."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        line: dict[str, Any] = {
-            "time": time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created)) + f".{int(record.msecs):03d}Z",
-            "level": record.levelname.lower(),
-            "logger": record.name,
-            "event": record.getMessage(),
-        }
-        line |= {key: value for key, value in vars(record).items() if key not in _STANDARD_ATTRIBUTES}
-        if record.exc_info:
-            line["exception"] = self.formatException(record.exc_info)
-        return json.dumps(line, default=str)
+def log_fields(scope: MutableMapping[str, Any]) -> dict[str, Any]:
+    """What endpoints add to their request's log line: plain numbers and words, nothing that a client wrote."""
+    fields: dict[str, Any] = scope.setdefault("viflow_log_fields", {})
+    return fields
 
 
 class RequestLogMiddleware:
-    """Takes X-Request-ID over where it is harmless, else makes one; returns it; logs method, path, status, duration.
+    """Takes X-Request-ID over where it is harmless, else makes one; returns it; logs and counts every request.
 
     Neither query strings nor headers nor bodies are logged.
     """
 
-    def __init__(self, app: ASGIApp) -> None:
+    def __init__(self, app: ASGIApp, metrics: ServiceMetrics) -> None:
         self.app = app
+        self._metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -70,6 +61,7 @@ class RequestLogMiddleware:
             await self.app(scope, receive, send_with_id)
         except ClientDisconnect:
             status = CLIENT_CLOSED_REQUEST
+            self._metrics.clients_gone.inc()
         except Exception:
             logger.exception("unexpected_error", extra={"request_id": request_id})
             if status:  # the answer has begun: only the server can end it, by closing the connection
@@ -80,23 +72,20 @@ class RequestLogMiddleware:
         finally:
             self._log(scope, request_id, status, started)
 
-    @staticmethod
-    def _log(scope: Scope, request_id: str, status: int, started: float) -> None:
+    def _log(self, scope: Scope, request_id: str, status: int, started: float) -> None:
+        seconds = time.perf_counter() - started
+        code = scope.get("viflow_problem_code")
+        route = getattr(scope.get("route"), "path", "none")  # paths of clients would be names without end
+        self._metrics.observe_request(route=route, method=scope["method"], status=status, seconds=seconds)
+        if code is not None:
+            self._metrics.observe_problem(code)
         fields = {
             "request_id": request_id,
             "method": scope["method"],
             "path": scope["path"][:_MAX_LOGGED_PATH],
             "status": status,
-            "duration_ms": round((time.perf_counter() - started) * 1e3, 3),
-            "code": scope.get("viflow_problem_code"),
+            "duration_ms": round(seconds * 1e3, 3),
+            "code": code,
+            **log_fields(scope),
         }
         logger.info("request", extra={key: value for key, value in fields.items() if value is not None})
-
-
-def configure_logging(level: str) -> None:
-    """Send this process's log to stderr, one JSON object a line; called once, at the start of the server process."""
-    handler = logging.StreamHandler()
-    handler.setFormatter(JsonLineFormatter())
-    root = logging.getLogger()
-    root.handlers = [handler]
-    root.setLevel(level.upper())

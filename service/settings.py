@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
-from typing import Any, Literal
+import re
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
-from pydantic_settings import BaseSettings, SettingsConfigDict, SettingsError
+from pydantic import BeforeValidator, Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict, SettingsError
 
 from viflow_anomaly.config import (
     MAX_THREADS,
@@ -20,13 +21,59 @@ from viflow_anomaly.config import (
     describe_validation,
 )
 from viflow_anomaly.errors import ConfigError
-from viflow_anomaly.settings import refuse_unknown_variables
+from viflow_anomaly.settings import ENVIRONMENT_PREFIX, SERVICE_SETTINGS, refuse_unknown_variables
 
 MEBIBYTE = 1024 * 1024
+MAX_WORKERS: Final = 256
+_ORIGIN: Final = re.compile(r"https?://[A-Za-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-f:]+\](:\d{1,5})?")
+_CAMERA: Final = re.compile(
+    r"(?P<width>[1-9]\d{1,4})x(?P<height>[1-9]\d{1,4})(@(?P<focal>[1-9]\d{0,5}(\.\d+)?))?", re.ASCII
+)
 
 
 def _usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class WarmUpCamera(NamedTuple):
+    """The size of a camera's images in pixels and its focal length, None: such images come without a calibration."""
+
+    width: int
+    height: int
+    focal_px: float | None
+
+    def __str__(self) -> str:
+        return f"{self.width}x{self.height}" + ("" if self.focal_px is None else f"@{self.focal_px:g}")
+
+
+def _cameras(value: Any) -> Any:
+    """``"752x480@458,640x480"`` as cameras; anything else as it is."""
+    if not isinstance(value, str):
+        return value
+    found = [_CAMERA.fullmatch(text.strip()) for text in value.split(",") if text.strip()]
+    if None in found:
+        raise ValueError(f"expected WIDTHxHEIGHT or WIDTHxHEIGHT@FOCAL, such as 752x480@458, found {value!r:.80}")
+    return tuple(
+        WarmUpCamera(int(one["width"]), int(one["height"]), float(one["focal"]) if one["focal"] else None)
+        for one in found
+        if one is not None
+    )
+
+
+def _origins(value: Any) -> Any:
+    """``"https://a.example,https://b.example"`` as texts, each a scheme and a host; anything else as it is."""
+    if not isinstance(value, str):
+        return value
+    found = [text.strip() for text in value.split(",") if text.strip()]
+    for text in found:
+        if not _ORIGIN.fullmatch(text):
+            raise ValueError(f"expected origins such as https://dashboard.example, found {text!r:.80}")
+    return tuple(found)
+
+
+Origins = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_origins)]
+Cameras = Annotated[tuple[WarmUpCamera, ...], NoDecode, BeforeValidator(_cameras)]
+_EUROC: Final = (WarmUpCamera(752, 480, None), WarmUpCamera(752, 480, 458.0))
 
 
 class ServiceSettings(BaseSettings):
@@ -58,12 +105,30 @@ class ServiceSettings(BaseSettings):
     max_body_bytes: PositiveInt = 48 * MEBIBYTE
     max_imu_samples: PositiveInt = 20_000
     threads: int = Field(default=1, ge=1, le=MAX_THREADS, description="threads of one detection")
-    max_concurrent: PositiveInt = Field(default_factory=_usable_cores, description="detections running at once")
+    workers: int = Field(default=1, ge=1, le=MAX_WORKERS, description="processes, each with its own model and limits")
+    max_concurrent: PositiveInt | None = Field(
+        default=None, description="detections running at once in a process; not given: the cores over the processes"
+    )
     max_queued: NonNegativeInt = Field(default=32, description="requests that may wait or upload beside them")
     queue_timeout_s: PositiveFloat = Field(default=10.0, description="longest wait for a turn")
     body_timeout_s: PositiveFloat = Field(default=30.0, description="longest upload")
+    request_timeout_s: PositiveFloat = Field(default=120.0, description="longest request, from head to last byte")
+    head_timeout_s: PositiveFloat = Field(default=10.0, description="longest wait for a request's head")
+    max_connections: PositiveInt = Field(default=1024, description="open connections of a process")
+    key_file: UsablePath | None = Field(default=None, description="API keys, lines of `viflow-anomaly keys new`")
+    insecure_no_keys: bool = Field(default=False, description="everybody who reaches the service may ask")
+    rate_limit_per_s: PositiveFloat | None = Field(default=None, description="requests a second of one key")
+    rate_limit_burst: PositiveInt = Field(default=20, description="requests of one key at once")
+    daily_quota: PositiveInt | None = Field(default=None, description="detections a day of one key")
+    allowed_origins: Origins = Field(default=(), description="sites whose pages may ask (CORS)")
     shutdown_timeout_s: PositiveInt = Field(default=20, description="time for running requests after SIGTERM")
+    warm_up: Cameras = Field(default=_EUROC, description="WIDTHxHEIGHT[@FOCAL] of what is judged before it is ready")
     log_level: Literal["debug", "info", "warning", "error"] = "info"
+
+    @property
+    def workers_at_once(self) -> int:
+        """Detections that run at once in one process."""
+        return self.max_concurrent or -(-_usable_cores() // self.workers)
 
     @property
     def image_limits(self) -> ImageLimits:
@@ -75,24 +140,51 @@ class ServiceSettings(BaseSettings):
         return 10 * self.max_imu_samples + 4096
 
 
-def load_settings(**overrides: Any) -> ServiceSettings:
-    """Settings from the environment, with ``overrides`` (those that are not None) on top.
+def load_settings(file_values: Mapping[str, Any] | None = None, **overrides: Any) -> ServiceSettings:
+    """Settings from the environment, over ``file_values``, with ``overrides`` (those that are not None) on top.
+
+    Args:
+        file_values: the table ``[service]`` of a configuration file: settings that the service alone takes.
 
     Raises:
         ConfigError: ``config_invalid`` with the setting at fault, or with a variable that nothing takes.
     """
-    refuse_unknown_variables(os.environ)
     _refuse_other_limits(os.environ)
+    return resolve_service_settings(file_values, **overrides)
+
+
+def resolve_service_settings(file_values: Mapping[str, Any] | None = None, **overrides: Any) -> ServiceSettings:
+    """As ``load_settings``, for a command that serves nothing: the other commands' limits may be set."""
+    refuse_unknown_variables(os.environ)
     given = {name: value for name, value in overrides.items() if value is not None}
+    settings = _validated(given, "service settings")
+    if file_values:
+        settings = _validated({**_checked_file_values(file_values), **given}, "service settings")
+    return settings
+
+
+def _checked_file_values(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Those that no variable of the environment overrides; checked all the same, so that an error names the file."""
+    for name in values:
+        if name not in SERVICE_SETTINGS:
+            raise ConfigError(
+                f"configuration file, [service]: expected {', '.join(SERVICE_SETTINGS)}, found {name!r:.80}",
+                code="config_invalid",
+                field=f"service.{name}"[:80],
+            )
+    _validated(values, "configuration file, [service]")
+    given = {name.upper() for name in os.environ}
+    return {name: value for name, value in values.items() if ENVIRONMENT_PREFIX + name.upper() not in given}
+
+
+def _validated(values: Mapping[str, Any], where: str) -> ServiceSettings:
     try:
-        return ServiceSettings(**given)
+        return ServiceSettings(**values)
     except ValidationError as err:
         place = ".".join(str(step) for step in err.errors()[0]["loc"])
-        raise ConfigError(
-            f"service settings: {describe_validation(err)}", code="config_invalid", field=place or None
-        ) from err
+        raise ConfigError(f"{where}: {describe_validation(err)}", code="config_invalid", field=place or None) from err
     except SettingsError as err:  # a section that is not JSON
-        raise ConfigError(f"service settings: {err}", code="config_invalid") from err
+        raise ConfigError(f"{where}: {err}", code="config_invalid") from err
 
 
 def _refuse_other_limits(names: Iterable[str]) -> None:

@@ -108,7 +108,7 @@ def documented_commands() -> list[list[str]]:
 
 def test_documented_commands_and_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
     for words in documented_commands():
-        depth = 2 if words[:1] in (["evaluate"], ["groundtruth"]) else 1
+        depth = 2 if words[:1] in (["evaluate"], ["groundtruth"], ["keys"]) else 1
         command = [word for word in words[:depth] if not word.startswith("-")]
         assert run([*command, "--help"]) == 0, words
         help_text = capsys.readouterr().out

@@ -29,7 +29,7 @@ from viflow_anomaly.geometry import Float32Array, pixel_grid
 from viflow_anomaly.model_input import prepare
 from viflow_anomaly.motion_evidence import JudgedCues, judge_cues, regions_of, require_our_cues, takes_head
 from viflow_anomaly.motion_input import MotionWindow
-from viflow_anomaly.pair_detector import Execution
+from viflow_anomaly.pair_detector import Execution, LoadedWeights
 from viflow_anomaly.pair_quality import Finding, judge_correction, judge_images, judge_window
 from viflow_anomaly.prediction import PredictedFlow, predict_flow
 from viflow_anomaly.runtime.interface import Runtime
@@ -178,6 +178,18 @@ class AnomalyDetector:
         takes_part = self._evidence is not None and self.config.evidence != "residual"
         evidence = self._evidence.runtime.backend if self._evidence is not None and takes_part else None
         return Execution(self._runtime.backend, evidence)
+
+    @property
+    def loaded_weights(self) -> tuple[LoadedWeights, ...]:
+        """The network, and the evidence head where one takes part."""
+        record, (network, evidence) = self._record, self.execution
+        found = [
+            LoadedWeights("network", record.name, record.version, record.sha256, record.model.preset, network),
+        ]
+        if self._evidence is not None and evidence is not None:
+            head = self._evidence.record
+            found.append(LoadedWeights("evidence_head", head.name, head.version, head.sha256, None, evidence))
+        return tuple(found)
 
     @property
     def motor_source(self) -> MotorSource | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol, Self
+from typing import Literal, NamedTuple, Protocol, Self
 
 from viflow_anomaly.config import DetectorConfig, MotorSource
 from viflow_anomaly.detection import Detection, ModelInfo
@@ -28,6 +28,20 @@ class Execution(NamedTuple):
         return {"network": self.network._asdict(), "evidence": self.evidence and self.evidence._asdict()}
 
 
+class LoadedWeights(NamedTuple):
+    """One of the networks in a detector: its part there, where it came from, what computes it.
+
+    ``preset`` is the network's structure by name; None: an evidence head, which has one structure.
+    """
+
+    role: Literal["network", "evidence_head"]
+    name: str
+    version: str
+    sha256: str
+    preset: str | None
+    backend: Backend
+
+
 class DetectorIdentity(Protocol):
     """Which weights, under which configuration, fed with what, computed how."""
 
@@ -48,5 +62,8 @@ class PairDetector(DetectorIdentity, Protocol):
     """Judges one pair; may be called from many threads."""
 
     def with_config(self, config: DetectorConfig) -> Self: ...
+
+    @property
+    def loaded_weights(self) -> tuple[LoadedWeights, ...]: ...
 
     def detect(self, pair: FramePair, *, decode_ms: float = 0.0) -> Detection: ...

@@ -40,6 +40,7 @@ ENVIRONMENT_PREFIX = "VIFLOW_"
 SERVICE_SETTINGS = (
     "host",
     "port",
+    "workers",
     "max_image_bytes",
     "max_image_pixels",
     "max_body_bytes",
@@ -48,10 +49,22 @@ SERVICE_SETTINGS = (
     "max_queued",
     "queue_timeout_s",
     "body_timeout_s",
+    "request_timeout_s",
+    "head_timeout_s",
+    "max_connections",
+    "key_file",
+    "insecure_no_keys",
+    "rate_limit_per_s",
+    "rate_limit_burst",
+    "daily_quota",
+    "allowed_origins",
     "shutdown_timeout_s",
+    "warm_up",
     "log_level",
 )
 """What the service alone takes and checks. It is built on the library, which cannot ask it; a test compares the two."""
+SERVICE_TABLE = "service"
+"""The table of a configuration file that holds them; the other commands pass it over."""
 TEST_SETTINGS = ("real_data",)
 SERVICE_LINK = re.compile(r"VIFLOW_ANOMALY(_\w+)?_(SERVICE_(HOST|PORT)(_\w+)?|PORT(_\d+_\w+)?)")
 """What Kubernetes puts into the environment of every container beside a service called ``viflow-anomaly``."""
@@ -106,13 +119,7 @@ def resolve_settings(
     Raises:
         ConfigError: ``config_invalid``, ``config_unreadable``, ``config_format_unknown``, ``assignment_invalid``.
     """
-    given = {key: value for key, value in (options or {}).items() if value is not None}
-    layers = [("defaults", nested((key.split("."), value) for key, value in (defaults or {}).items()))]
-    if config_file is not None:
-        layers.append((str(config_file), read_config_file(config_file)))
-    layers.append(("environment", environment_values(environment)))
-    layers.append(("--set", assignment_values(assignments)))
-    layers.append(("command line", nested((key.split("."), value) for key, value in given.items())))
+    layers = _layers(config_file, environment, assignments, options, defaults)
     merged: Values = {}
     settings = Settings()
     for where, values in layers:
@@ -120,6 +127,44 @@ def resolve_settings(
             merged = _merge(merged, values)
             settings = Settings.from_mapping(merged, where=where)
     return settings
+
+
+def setting_origins(
+    *, config_file: Path | None = None, environment: Mapping[str, str], assignments: Iterable[str] = ()
+) -> dict[str, str]:
+    """Dotted name of every setting that was set -> the layer whose value holds; raises as ``resolve_settings``."""
+    origins: dict[str, str] = {}
+    for where, values in _layers(config_file, environment, assignments, None, None):
+        origins |= dict.fromkeys(_leaves(values), where)
+    return origins
+
+
+def _layers(
+    config_file: Path | None,
+    environment: Mapping[str, str],
+    assignments: Iterable[str],
+    options: Mapping[str, Any] | None,
+    defaults: Mapping[str, Any] | None,
+) -> list[tuple[str, Values]]:
+    """Where each comes from and what it sets, lowest first."""
+    given = {key: value for key, value in (options or {}).items() if value is not None}
+    layers = [("defaults", nested((key.split("."), value) for key, value in (defaults or {}).items()))]
+    if config_file is not None:
+        values = read_config_file(config_file)
+        values.pop(SERVICE_TABLE, None)
+        layers.append((str(config_file), values))
+    layers.append(("environment", environment_values(environment)))
+    layers.append(("--set", assignment_values(assignments)))
+    layers.append(("command line", nested((key.split("."), value) for key, value in given.items())))
+    return layers
+
+
+def _leaves(values: Values, above: str = "") -> Iterator[str]:
+    for name, value in values.items():
+        if isinstance(value, dict) and value:
+            yield from _leaves(value, f"{above}{name}.")
+        else:
+            yield above + name
 
 
 def read_config_file(path: Path) -> Values:

@@ -13,11 +13,12 @@ import pytest
 from pair_world import Ask, PairFolder
 
 from viflow_anomaly.cli import main as cli_main
+from viflow_anomaly.cli.configuration import masked
 from viflow_anomaly.cli.progress import stderr_progress
 from viflow_anomaly.detection import load_detection_schema
 from viflow_anomaly.errors import CheckpointError
 
-COMMANDS = ("detect", "batch", "benchmark", "calibrate", "simulate", "train", "serve", "schema", "config")
+COMMANDS = ("detect", "batch", "benchmark", "calibrate", "simulate", "train", "serve", "schema", "config", "keys new")
 HEAVY = {"torch", "cv2", "skimage", "mujoco", "fastapi"}
 
 
@@ -28,7 +29,7 @@ def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_help_loads_nothing_heavy() -> None:
-    asked = [["--help"], ["--version"], ["schema"], *([command, "--help"] for command in COMMANDS)]
+    asked = [["--help"], ["--version"], ["schema"], *([*command.split(), "--help"] for command in COMMANDS)]
     code = f"""
 import sys
 from viflow_anomaly.cli.main import run
@@ -56,7 +57,7 @@ def test_a_threshold_is_applied_without_scipy() -> None:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_shows_an_example(ask: Ask, command: str) -> None:
-    answer = ask([command, "--help"])
+    answer = ask([*command.split(), "--help"])
     assert answer.code == 0
     assert "Example" in answer.out
     assert answer.out.count(f"viflow-anomaly {command}") >= 2
@@ -64,7 +65,7 @@ def test_help_shows_an_example(ask: Ask, command: str) -> None:
 
 def test_help_names_every_command(ask: Ask) -> None:
     answer = ask(["--help"])
-    assert all(f" {command} " in answer.out for command in COMMANDS)
+    assert all(f" {command.split()[0]} " in answer.out for command in COMMANDS)
     assert "Exit codes: 0 done" in answer.out
 
 
@@ -100,6 +101,53 @@ def test_config_prints_what_resolves_here(ask: Ask, monkeypatch: pytest.MonkeyPa
 def test_a_misspelt_variable_is_refused(ask: Ask, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
     monkeypatch.setenv("VIFLOW_TRAINING__STEP", "7")
     assert ask([command]).is_refusal("found VIFLOW_TRAINING__STEP; the closest known one is VIFLOW_TRAINING__STEPS")
+
+
+def test_config_shows_the_service_and_where_values_come_from(
+    ask: Ask, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("VIFLOW_PORT", "9001")
+    monkeypatch.setenv("VIFLOW_DETECTOR__REGIONS__MAX_REGIONS", "8")
+    file = tmp_path / "settings.toml"
+    file.write_text("threads = 2\n[detector.regions]\nmax_regions = 3\n[service]\nport = 1\nmax_queued = 5\n")
+    arguments = ["config", "--config", str(file), "--set", "threads=3"]
+    service = json.loads(ask(arguments).out)["service"]
+    assert (service["port"], service["max_queued"], service["host"]) == (9001, 5, "127.0.0.1")
+    assert json.loads(ask([*arguments, "--origins"]).out) == {
+        "detector.regions.max_regions": {"value": 8, "from": "environment"},
+        "service.max_queued": {"value": 5, "from": str(file)},
+        "service.port": {"value": 9001, "from": "environment"},
+        "threads": {"value": 3, "from": "--set"},
+    }
+
+
+def test_config_takes_the_limits_of_the_other_commands(ask: Ask, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VIFLOW_LIMITS__MAX_BYTES", "5000")
+    assert json.loads(ask(["config"]).out)["limits"]["max_bytes"] == 5000
+
+
+def test_what_is_secret_is_masked() -> None:
+    assert masked(
+        {
+            "password": "x",
+            "smtp_token": 7,
+            "no_password": None,
+            "key_file": "keys.txt",
+            "database": "postgresql://viflow:gehe:im@db:5432/x",
+            "dsn": "host=db password=geheim user=u",
+            "plain": "http://me@host/a:b",
+            "list": ["mqtt://a:geheim@h", 1],
+        }
+    ) == {
+        "password": "***",
+        "smtp_token": "***",
+        "no_password": None,
+        "key_file": "keys.txt",
+        "database": "postgresql://viflow:***@db:5432/x",
+        "dsn": "host=db password=*** user=u",
+        "plain": "http://me@host/a:b",
+        "list": ["mqtt://a:***@h", 1],
+    }
 
 
 def test_config_refuses_unknown_keys(ask: Ask) -> None:
@@ -275,3 +323,61 @@ def test_serve_refuses_bad_settings(ask: Ask, monkeypatch: pytest.MonkeyPatch) -
     assert ask(["serve", "--port", "70000"]).is_refusal("Invalid value for '--port'")
     monkeypatch.setenv("VIFLOW_MAX_CONCURRENT", "0")
     assert ask(["serve"]).is_refusal("[config_invalid]")
+
+
+def test_serve_takes_its_own_table_of_the_file(ask: Ask, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    stand_in(monkeypatch, "viflow_anomaly_service.server", run=asked.append)
+    file = tmp_path / "service.toml"
+    file.write_text('threads = 2\n[service]\nworkers = 3\nmax_queued = 9\nwarm_up = "64x48"\n')
+    assert ask(["serve", "--config", str(file), "--workers", "4"]).code == 0
+    settings = asked[0]
+    assert (settings.threads, settings.workers, settings.max_queued, settings.warm_up) == (2, 4, 9, ((64, 48, None),))
+    assert ask(["config", "--config", str(file)]).code == 0
+    file.write_text("[service]\nmax_queue = 9\n")
+    assert ask(["serve", "--config", str(file)]).is_refusal("configuration file, [service]: expected host")
+    file.write_text("service = 9\n")
+    assert ask(["serve", "--config", str(file)]).is_refusal("expected a table [service], found int")
+
+
+# --- keys
+
+
+def test_keys_new_prints_the_line_and_shows_the_key_once(ask: Ask, tmp_path: Path) -> None:
+    from viflow_anomaly_service.api_keys import KeyRing  # noqa: PLC0415
+
+    answer = ask(["keys", "new", "--scope", "detect", "--scope", "read", "--name", "drone7"])
+    assert answer.code == 0
+    (tmp_path / "keys.txt").write_text(answer.out)
+    (shown,) = (word for word in answer.err.split() if word.startswith("vfa_drone7_"))
+    assert shown not in answer.out
+    found = KeyRing(tmp_path / "keys.txt").find(shown)
+    assert found is not None
+    assert found.scopes == {"detect", "read"}
+
+
+def test_keys_new_speaks_json_and_makes_names(ask: Ask) -> None:
+    made = [json.loads(ask(["keys", "new", "--scope", "read", "--json"]).out) for _ in range(2)]
+    assert made[0]["line"].split()[0] != made[1]["line"].split()[0]
+    assert made[0]["key"].startswith(f"vfa_{made[0]['line'].split()[0]}_")
+
+
+def test_keys_new_refuses_an_unknown_scope(ask: Ask) -> None:
+    assert ask(["keys", "new", "--scope", "write"]).is_refusal("expected one or more of detect, read, admin")
+    assert ask(["keys", "new", "--scope", "read", "--name", "A B"]).is_refusal("[key_name_invalid]")
+
+
+def test_serve_hands_keys_over(ask: Ask, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    stand_in(monkeypatch, "viflow_anomaly_service.server", run=asked.append)
+    assert ask(["serve", "--key-file", "keys.txt"]).code == 0
+    assert ask(["serve", "--insecure-no-keys"]).code == 0
+    assert [(settings.key_file, settings.insecure_no_keys) for settings in asked] == [
+        (Path("keys.txt"), False),
+        (None, True),
+    ]
+
+
+def test_serve_explains_why_it_does_not_start_without_keys(ask: Ask) -> None:
+    answer = ask(["serve", "--host", "0.0.0.0", "--port", "0"])  # noqa: S104
+    assert answer.is_refusal("viflow-anomaly keys new --scope detect")

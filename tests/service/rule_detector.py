@@ -17,7 +17,7 @@ from viflow_anomaly.detection import (
     ResidualSummary,
     rois_from_regions,
 )
-from viflow_anomaly.pair_detector import Backend, Execution
+from viflow_anomaly.pair_detector import Backend, Execution, LoadedWeights
 from viflow_anomaly.regions import find_regions
 from viflow_anomaly.sensor_data import FramePair
 
@@ -42,6 +42,11 @@ class RuleDetector:
         self.may_go = may_go
         self.error = error
         self.calls = [] if calls is None else calls
+
+    @property
+    def loaded_weights(self) -> tuple[LoadedWeights, ...]:
+        network = LoadedWeights("network", MODEL.name, MODEL.version, MODEL.sha256, "rule", self.execution.network)
+        return (network,)
 
     def with_config(self, config: DetectorConfig) -> Self:
         return type(self)(config=config, may_go=self.may_go, error=self.error, calls=self.calls)

@@ -56,7 +56,7 @@ def test_overload_is_refused_and_recovers() -> None:
     ):
         accepted = [clients.submit(server.post_json, json_request()) for _ in range(2)]
         try:
-            wait_until(lambda: server.app.state.gate.present == 2)
+            wait_until(lambda: server.app.state.core.gate.present == 2)
             for _ in range(3):
                 response = server.post_json(json_request())
                 assert_problem(response, 503, "overloaded", None)
@@ -101,7 +101,7 @@ def test_a_client_that_leaves_in_the_middle_of_its_upload(caplog: pytest.LogCapt
     with live_server(lambda settings: RuleDetector(), max_concurrent=1, max_queued=0) as server:
         begin_request(server.port, b"{", announced=1000).close()
         wait_until(lambda: logged_statuses(caplog) == [499])
-        assert server.app.state.gate.present == 0
+        assert server.app.state.core.gate.present == 0
         assert server.post_json(json_request()).status_code == 200
     assert "unexpected_error" not in caplog.messages
 
@@ -119,7 +119,7 @@ def test_nothing_is_computed_for_a_client_that_left_the_queue(caplog: pytest.Log
             wait_until(lambda: len(detector.calls) == 1)
             body = json.dumps(json_request(seed=5)).encode()
             waiting = begin_request(server.port, body, announced=len(body))
-            wait_until(lambda: server.app.state.gate.present == 2)
+            wait_until(lambda: server.app.state.core.gate.present == 2)
             waiting.close()
             assert server.client.get("/healthz").status_code == 200  # the server has seen the closing by now
         finally:
@@ -145,3 +145,71 @@ def test_faults_of_ours_tell_the_client_nothing(error: Exception, caplog: pytest
         assert server.client.get("/healthz").status_code == 200
     faults = [record for record in caplog.records if record.getMessage() == "unexpected_error"]
     assert [vars(record)["request_id"] for record in faults] == [response.json()["request_id"]]
+
+
+def test_work_for_a_client_that_leaves_while_it_runs_is_dropped_and_its_place_is_free(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    may_go = threading.Event()
+    detector = RuleDetector(may_go=may_go)
+    with live_server(lambda settings: detector, max_concurrent=1, max_queued=0) as server:
+        body = json.dumps(json_request()).encode()
+        try:
+            leaving = begin_request(server.port, body, announced=len(body))
+            wait_until(lambda: len(detector.calls) == 1)
+            leaving.close()
+            wait_until(lambda: logged_statuses(caplog) == [499])
+            assert server.app.state.core.gate.present == 0
+        finally:
+            may_go.set()
+        assert server.post_json(json_request()).status_code == 200
+    assert "unexpected_error" not in caplog.messages
+
+
+def test_many_clients_get_their_own_answers_and_the_log_says_how_long_each_stage_took(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    with (
+        live_server(lambda settings: RuleDetector(), max_concurrent=2, max_queued=64) as server,
+        ThreadPoolExecutor(max_workers=24) as clients,
+    ):
+        alone = [server.post_json(json_request(seed=seed)).json()["rois"] for seed in range(8)]
+        together = list(clients.map(lambda number: server.post_json(json_request(seed=number % 8)), range(96)))
+        assert [answer.status_code for answer in together] == [200] * 96
+        assert [answer.json()["rois"] for answer in together] == alone * 12
+        assert server.app.state.core.gate.present == 0
+        wait_until(lambda: len(logged_statuses(caplog)) == 104)
+    line = next(vars(record) for record in caplog.records if vars(record).get("path") == "/detect")
+    for stage in ("upload", "queue", "decode", "detect", "encode"):
+        assert line[f"{stage}_ms"] >= 0
+    assert (line["detection"], line["regions"]) == ("ok", len(alone[0]))
+
+
+def test_slow_uploads_hold_places_but_nobody_else_up() -> None:
+    with live_server(lambda settings: RuleDetector(), max_concurrent=1, max_queued=2, body_timeout_s=20) as server:
+        slow = [begin_request(server.port, b"{", announced=1000) for _ in range(2)]
+        wait_until(lambda: server.app.state.core.gate.present == 2)
+        assert server.post_json(json_request()).status_code == 200
+        slow.append(begin_request(server.port, b"{", announced=1000))
+        wait_until(lambda: server.app.state.core.gate.present == 3)
+        assert_problem(server.post_json(json_request()), 503, "overloaded", None)
+        assert server.client.get("/readyz").status_code == 200
+        for connection in slow:
+            connection.close()
+        wait_until(lambda: server.app.state.core.gate.present == 0)
+        assert server.post_json(json_request()).status_code == 200
+
+
+def test_a_client_that_reads_slowly_holds_no_worker(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    with live_server(lambda settings: RuleDetector(), max_concurrent=1, max_queued=0) as server:
+        body = json.dumps(json_request()).encode()
+        lazy = begin_request(server.port, body, announced=len(body))
+        try:
+            wait_until(lambda: logged_statuses(caplog) == [200])
+            assert server.post_json(json_request()).status_code == 200
+            assert lazy.recv(12) == b"HTTP/1.1 200"
+        finally:
+            lazy.close()

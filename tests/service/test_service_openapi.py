@@ -57,6 +57,8 @@ def test_operation_ids_are_stable(document: dict[str, Any]) -> None:
         ("/healthz", "get"): "healthz",
         ("/readyz", "get"): "readyz",
         ("/version", "get"): "version",
+        ("/metrics", "get"): "metrics",
+        ("/models", "get"): "models",
         ("/schemas/detection-1.0.json", "get"): "detectionSchema",
         ("/detect", "post"): "detect",
     }
@@ -87,6 +89,19 @@ def test_detect_documents_every_status(document: dict[str, Any]) -> None:
     assert set(responses) == {"200"} | {str(status) for status in EXAMPLE_FAULTS}
     assert all("application/problem+json" in answer["content"] for name, answer in responses.items() if name != "200")
     assert "Retry-After" in responses["503"]["headers"]
+
+
+def test_every_operation_says_which_key_it_needs(document: dict[str, Any]) -> None:
+    schemes = document["components"]["securitySchemes"]
+    assert {scheme["type"] for scheme in schemes.values()} == {"http", "apiKey"}
+    for path, method, operation in operations(document):
+        if path in ("/healthz", "/readyz"):
+            assert operation["security"] == []
+            continue
+        assert [name for way in operation["security"] for name in way] == list(schemes)
+        assert {"401", "403", "429"} <= set(operation["responses"]), (method, path)
+        assert "Retry-After" in operation["responses"]["429"]["headers"]
+    assert document["paths"]["/detect"]["post"]["security"][0] == {"bearerKey": ["detect"]}
 
 
 def test_the_json_example_works(server: LiveServer, document: dict[str, Any]) -> None:

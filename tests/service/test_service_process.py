@@ -2,77 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import logging
 import os
-import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
-from service_world import json_request, wait_until
 
 from viflow_anomaly.errors import CheckpointError, ConfigError
 from viflow_anomaly_service import server as service_server
 from viflow_anomaly_service.__main__ import main
 from viflow_anomaly_service.settings import ServiceSettings
-
-SERVE_BY_RULE = """
-import sys, threading
-sys.path.insert(0, {tests!r})
-from rule_detector import RuleDetector
-from viflow_anomaly_service.server import run
-from viflow_anomaly_service.settings import load_settings
-
-class SlowDetector(RuleDetector):
-    def detect(self, pair, *, decode_ms=0.0):
-        threading.Event().wait({delay_s})
-        return super().detect(pair, decode_ms=decode_ms)
-
-run(load_settings(port=0, shutdown_timeout_s=10), load_detector=lambda settings: SlowDetector())
-"""
-
-
-@contextlib.contextmanager
-def serving_process(*, delay_s: float = 0.0) -> Iterator[tuple[subprocess.Popen[str], httpx.Client]]:
-    code = SERVE_BY_RULE.format(tests=str(Path(__file__).parent), delay_s=delay_s)
-    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
-    try:
-        assert process.stderr is not None
-        listening: dict[str, Any] = {}
-        while listening.get("event") != "listening":
-            listening = json.loads(process.stderr.readline())
-        with httpx.Client(base_url=f"http://127.0.0.1:{listening['port']}", timeout=20, trust_env=False) as client:
-            wait_until(lambda: client.get("/readyz").status_code == 200, seconds=20)
-            yield process, client
-    finally:
-        process.kill()
-        process.wait()
-        if process.stderr is not None:
-            process.stderr.close()
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_lets_running_requests_finish(number: signal.Signals) -> None:
-    with serving_process(delay_s=0.7) as (process, client), ThreadPoolExecutor(max_workers=1) as clients:
-        running = clients.submit(client.post, "/detect", json=json_request())
-        time.sleep(0.3)
-        process.send_signal(number)
-        assert running.result().status_code == 200
-        status = process.wait(timeout=10)
-        assert status == (0 if number == signal.SIGINT else -signal.SIGTERM)
-        assert process.stderr is not None
-        lines = [json.loads(line) for line in process.stderr.read().splitlines()]
-        assert [line["status"] for line in lines if line.get("path") == "/detect"] == [200]
-        assert not [line for line in lines if line["level"] == "error"]
 
 
 def run_module(**environment: str) -> subprocess.CompletedProcess[str]:
@@ -134,6 +77,10 @@ def test_run_ends_with_the_error_of_a_model_that_cannot_be_loaded(
 def test_bind_both_families_and_refuses_what_is_not_ours() -> None:
     with service_server.bind("127.0.0.1", 0) as listener:
         assert listener.family == socket.AF_INET
+        with socket.create_connection(listener.getsockname(), timeout=5):
+            accepted, _ = listener.accept()
+            with accepted:
+                assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
         with pytest.raises(ConfigError) as caught:
             service_server.bind(*listener.getsockname())
         assert (caught.value.code, caught.value.field) == ("address_unavailable", "port")

@@ -23,12 +23,13 @@ from service_world import INTERVAL_NS, T0, LiveServer, assert_problem, base64_te
 
 from viflow_anomaly.alarm_calibration import make_calibration, write_calibration
 from viflow_anomaly.alarm_footage import JudgedPair, WatchedRecording, footage_of
+from viflow_anomaly.config import DetectorConfig
 from viflow_anomaly.datasets.camera_json import camera_from_mapping
 from viflow_anomaly.detection import load_detection_schema, to_json_dict
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples
-from viflow_anomaly_service.app import load_bundled_or_configured
+from viflow_anomaly_service.detector_loading import load_bundled_or_configured
 from viflow_anomaly_service.examples import example_json_request
 from viflow_anomaly_service.settings import load_settings
 
@@ -260,3 +261,25 @@ def test_the_printed_curl_lines_work(server: LiveServer) -> None:
             answers.append(answer)
     assert len(answers) == 2
     assert answers[0] == answers[1]
+
+
+def test_models_names_network_and_head_as_they_are_on_disk(server: LiveServer) -> None:
+    found = server.client.get("/models").json()["models"]
+    assert [model["role"] for model in found] == ["network", "evidence_head"]
+    for model, name in zip(found, ("viflow-calibrated", "viflow-evidence"), strict=True):
+        record = json.loads((ROOT / "viflow_anomaly" / "weights" / f"{name}.json").read_text())
+        assert {key: model[key] for key in ("name", "version", "sha256")} == {
+            key: record[key] for key in ("name", "version", "sha256")
+        }
+    assert [model["preset"] for model in found] == ["calibrated", None]
+    assert all(model["runtime"] in ("openvino", "onnxruntime", "torch") and model["device"] for model in found)
+
+
+def test_models_fit_their_schema(server: LiveServer) -> None:
+    content = server.client.get("/openapi.json").json()["paths"]["/models"]["get"]["responses"]["200"]["content"]
+    jsonschema.validate(server.client.get("/models").json(), content["application/json"]["schema"])
+    without_head = live_server(
+        load_bundled_or_configured, detector=DetectorConfig.model_validate({"evidence": "residual"})
+    )
+    with without_head as other:
+        assert [model["role"] for model in other.client.get("/models").json()["models"]] == ["network"]

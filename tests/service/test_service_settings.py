@@ -14,7 +14,8 @@ def test_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(name, raising=False)
     settings = load_settings()
     assert (settings.host, settings.port, settings.threads, settings.checkpoint) == ("127.0.0.1", 8000, 1, None)
-    assert settings.max_concurrent >= 1
+    assert settings.workers_at_once >= 1
+    assert [str(camera) for camera in settings.warm_up] == ["752x480", "752x480@458"]
     assert (settings.image_limits.max_bytes, settings.image_limits.max_pixels) == (2**24, 2**24)
 
 
@@ -39,6 +40,11 @@ def test_argument_over_environment_over_default(monkeypatch: pytest.MonkeyPatch)
         ("VIFLOW_MAX_BODY_BYTES", "-1", "max_body_bytes"),
         ("VIFLOW_QUEUE_TIMEOUT_S", "inf", "queue_timeout_s"),
         ("VIFLOW_LOG_LEVEL", "loud", "log_level"),
+        ("VIFLOW_WORKERS", "0", "workers"),
+        ("VIFLOW_WARM_UP", "752", "warm_up"),
+        ("VIFLOW_WARM_UP", "752x480,0x1", "warm_up"),
+        ("VIFLOW_WARM_UP", "752x480@0", "warm_up"),
+        ("VIFLOW_WARM_UP", "752x480@", "warm_up"),
         ("VIFLOW_DETECTOR__REGIONS__THRESHOLD", "1", "detector.regions.threshold"),
     ],
 )
@@ -94,3 +100,37 @@ def test_an_unreadable_section_is_named(monkeypatch: pytest.MonkeyPatch) -> None
         load_settings()
     assert caught.value.code == "config_invalid"
     assert "detector" in str(caught.value)
+
+
+def test_cores_are_shared_out_among_the_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("viflow_anomaly_service.settings._usable_cores", lambda: 8)
+    assert [ServiceSettings(workers=count).workers_at_once for count in (1, 2, 3, 16)] == [8, 4, 3, 1]
+    assert ServiceSettings(workers=2, max_concurrent=5).workers_at_once == 5
+
+
+def test_cameras_to_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VIFLOW_WARM_UP", "640x480, 1242x375@721.5")
+    assert load_settings().warm_up == ((640, 480, None), (1242, 375, 721.5))
+    monkeypatch.setenv("VIFLOW_WARM_UP", "")
+    assert load_settings().warm_up == ()
+
+
+def test_argument_over_environment_over_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VIFLOW_MAX_QUEUED", "7")
+    file_values = {"max_queued": 5, "queue_timeout_s": 2.5, "port": 9001, "warm_up": "64x64"}
+    settings = load_settings(file_values, port=9002)
+    assert (settings.max_queued, settings.queue_timeout_s, settings.port) == (7, 2.5, 9002)
+    assert settings.warm_up == ((64, 64, None),)
+
+
+@pytest.mark.parametrize("name", ["max_queue", "detector", "checkpoint"])
+def test_the_table_of_the_file_holds_what_the_service_alone_takes(name: str) -> None:
+    with pytest.raises(ConfigError, match=r"configuration file, \[service\]") as caught:
+        load_settings({name: 1})
+    assert (caught.value.code, caught.value.field) == ("config_invalid", f"service.{name}")
+
+
+def test_a_wrong_value_of_the_file_is_refused_where_the_environment_hides_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VIFLOW_MAX_QUEUED", "7")
+    with pytest.raises(ConfigError, match=r"configuration file, \[service\].*max_queued"):
+        load_settings({"max_queued": -1})

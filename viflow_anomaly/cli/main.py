@@ -24,6 +24,7 @@ from viflow_anomaly.cli import (
     evaluate,
     export,
     groundtruth,
+    keys,
     schema,
     serve,
     simulate,
@@ -55,6 +56,7 @@ for module in (
     benchmark,
     export,
     serve,
+    keys,
     schema,
     configuration,
 ):

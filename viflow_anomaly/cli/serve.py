@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -26,6 +27,16 @@ if TYPE_CHECKING:
 def serve(
     host: Annotated[str | None, typer.Option(help="Address to listen on (default 127.0.0.1).")] = None,
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port (default 8000; 0 takes a free one).")] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Processes (default 1), each with its own model and queue.")
+    ] = None,
+    key_file: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="API keys: lines of `viflow-anomaly keys new`.")
+    ] = None,
+    insecure_no_keys: Annotated[
+        bool | None,
+        typer.Option("--insecure-no-keys", help="Let everybody ask who can reach an address that is not loopback."),
+    ] = None,
     checkpoint: Checkpoint = None,
     calibration: Calibration = None,
     threads: Threads = None,
@@ -34,13 +45,20 @@ def serve(
     config: ConfigFile = None,
     assignments: Assignments = None,
 ) -> None:
-    """Serve POST /detect, /healthz, /readyz and /version over HTTP until SIGINT or SIGTERM.
+    """Serve POST /detect, /healthz, /readyz, /version, /models and /metrics over HTTP until SIGINT or SIGTERM.
 
-    Limits and queue lengths are environment variables (VIFLOW_MAX_IMAGE_BYTES, ...); docs/service.md lists them.
+    On loopback no key is needed; where other machines can reach the service it starts with a key file only.
 
-    [bold]Example[/bold]
+    Limits and queue lengths are environment variables (VIFLOW_MAX_IMAGE_BYTES, ...) or stand in the configuration
+    file's table "service"; docs/service.md lists them.
 
-      viflow-anomaly serve --host 0.0.0.0 --port 8000
+    [bold]Examples[/bold]
+
+      viflow-anomaly keys new --scope detect
+
+      viflow-anomaly serve --host 0.0.0.0 --port 8000 --key-file keys.txt
+
+      viflow-anomaly serve --workers 4 --config service.toml
     """
     options = {"checkpoint": checkpoint, "calibration": calibration, "threads": threads, "device": device}
     settings = settings_from(config, assignments, {**options, "runtime": runtime})
@@ -50,8 +68,12 @@ def serve(
     server = import_module("viflow_anomaly_service.server")
     server.run(
         service_settings.load_settings(
+            service_table(config),
             host=host,
             port=port,
+            workers=workers,
+            key_file=key_file,
+            insecure_no_keys=insecure_no_keys,
             checkpoint=settings.checkpoint,
             evidence_head=settings.evidence_head,
             precision=settings.precision,
@@ -63,6 +85,24 @@ def serve(
             detector=settings.detector,
         )
     )
+
+
+def service_table(config: Path | None) -> dict[str, Any]:
+    """What the configuration file says to the service alone.
+
+    Raises:
+        ConfigError: ``config_invalid``: it is no table.
+    """
+    from viflow_anomaly.settings import SERVICE_TABLE, read_config_file
+
+    table = {} if config is None else read_config_file(config).get(SERVICE_TABLE, {})
+    if not isinstance(table, dict):
+        raise ConfigError(
+            f"{config}: expected a table [{SERVICE_TABLE}], found {type(table).__name__}",
+            code="config_invalid",
+            field=SERVICE_TABLE,
+        )
+    return table
 
 
 def _refuse_other_limits(limits: ImageLimits) -> None:

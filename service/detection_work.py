@@ -1,0 +1,86 @@
+"""One request in a worker's thread: decode, detect, encode, each under its own clock."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from viflow_anomaly.detection import Detection, to_json
+from viflow_anomaly.errors import ViflowError
+from viflow_anomaly.pair_detector import PairDetector
+from viflow_anomaly_service.detection_request import read_pair
+from viflow_anomaly_service.detector_pool import Job
+from viflow_anomaly_service.metrics import ServiceMetrics, Stage
+from viflow_anomaly_service.problems import problem_of_error
+from viflow_anomaly_service.settings import ServiceSettings
+
+
+class DetectionWork:
+    """What a worker does for ``POST /detect``.
+
+    Args:
+        detector: shared by all threads.
+        body: the whole body; let go of once it is decoded.
+        content_type: of the body.
+        settings: limits.
+        metrics: told of every stage and of the detection.
+
+    Attributes:
+        log: what the request's log line says of it: milliseconds by stage, status and number of regions.
+    """
+
+    def __init__(
+        self,
+        detector: PairDetector,
+        body: bytes,
+        content_type: str,
+        *,
+        settings: ServiceSettings,
+        metrics: ServiceMetrics,
+    ) -> None:
+        self._detector = detector
+        self._body = body
+        self._content_type = content_type
+        self._settings = settings
+        self._metrics = metrics
+        self.log: dict[str, Any] = {}
+
+    def __call__(self, job: Job[bytes]) -> bytes:
+        """The detection as UTF-8 JSON.
+
+        Raises:
+            Problem: whatever is wrong with the request, with its code and field.
+            AbandonedError: between two stages, when the client has gone.
+        """
+        self._note("queue", job.waited_s)
+        with self._stage("decode"):
+            pair, config, field_names = read_pair(self._detector, self._body, self._content_type, self._settings)
+            self._body = b""
+        job.require_wanted()
+        with self._stage("detect"):
+            try:
+                detection = self._detector.with_config(config).detect(pair, decode_ms=self.log["decode_ms"])
+            except ViflowError as err:
+                raise problem_of_error(err, field_names) from err
+        self._metrics.observe_detection(detection)
+        self._describe(detection)
+        job.require_wanted()
+        with self._stage("encode"):
+            return to_json(detection).encode("utf-8")
+
+    @contextmanager
+    def _stage(self, stage: Stage) -> Iterator[None]:
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._note(stage, time.perf_counter() - started)
+
+    def _note(self, stage: Stage, seconds: float) -> None:
+        self._metrics.observe_stage(stage, seconds)
+        self.log[f"{stage}_ms"] = round(seconds * 1e3, 3)
+
+    def _describe(self, detection: Detection) -> None:
+        self.log |= {"detection": detection.status, "regions": len(detection.rois)}

@@ -1,0 +1,30 @@
+"""What all endpoints share: one value, made by ``create_app`` and handed to the modules that add endpoints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from viflow_anomaly_service.admission import AdmissionGate
+from viflow_anomaly_service.detector_pool import DetectorPool
+from viflow_anomaly_service.detector_slot import DetectorSlot
+from viflow_anomaly_service.metrics import ServiceMetrics
+from viflow_anomaly_service.settings import ServiceSettings
+
+
+@dataclass(frozen=True)
+class ServiceCore:
+    """The parts of one application.
+
+    Args:
+        settings: as they were resolved.
+        metrics: where everything is counted.
+        slot: the detector, once it is loaded.
+        gate: who may come in.
+        pool: who does the work.
+    """
+
+    settings: ServiceSettings
+    metrics: ServiceMetrics
+    slot: DetectorSlot
+    gate: AdmissionGate
+    pool: DetectorPool
