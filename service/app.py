@@ -21,6 +21,8 @@ from viflow_anomaly_service.request_log import RequestLogMiddleware
 from viflow_anomaly_service.service_core import ServiceCore
 from viflow_anomaly_service.settings import ServiceSettings, load_settings
 from viflow_anomaly_service.state_endpoints import VERSION, add_state
+from viflow_anomaly_service.store.attach import configured_keeper
+from viflow_anomaly_service.store.endpoints import add_detections
 
 MEMORY_SECONDS: Final = 5.0
 
@@ -39,7 +41,8 @@ def create_app(
         on_load_failure: told when that raised; ``/readyz`` then stays at 503.
 
     Raises:
-        ConfigError: ``config_invalid``, an environment variable that cannot be used.
+        ConfigError: ``config_invalid``, an environment variable that cannot be used; ``store_url_invalid``.
+        MissingDependencyError: ``store_missing``.
     """
     core = _build(settings or load_settings(), load_detector, on_load_failure)
 
@@ -47,11 +50,15 @@ def create_app(
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         tasks = [asyncio.create_task(core.slot.fill()), asyncio.create_task(_watch_memory(core.metrics))]
         core.pool.start()
+        if core.keeper is not None:
+            core.keeper.start()
         yield
         core.gate.close()
         for task in tasks:
             task.cancel()
         await asyncio.to_thread(core.pool.close)
+        if core.keeper is not None:
+            await core.keeper.close()
 
     app = FastAPI(
         title="viflow-anomaly",
@@ -67,6 +74,7 @@ def create_app(
     add_state(app, core)
     add_detect(app, core)
     complete_openapi(app)
+    add_detections(app, core)
     return app
 
 
@@ -82,6 +90,7 @@ def _build(
         slot=DetectorSlot(lambda: load_detector(settings), metrics=metrics, on_failure=on_load_failure),
         gate=AdmissionGate(places=workers + settings.max_queued, metrics=metrics),
         pool=DetectorPool(workers=workers, metrics=metrics),
+        keeper=configured_keeper(settings, metrics),
     )
 
 

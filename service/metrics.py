@@ -19,7 +19,7 @@ from viflow_anomaly.detection import SCHEMA_VERSION, Detection, ModelInfo
 
 MULTIPROCESS_VARIABLE: Final = "PROMETHEUS_MULTIPROC_DIR"
 ShedReason = Literal["queue_full", "deadline", "shutting_down", "not_ready"]
-Stage = Literal["upload", "queue", "decode", "detect", "encode"]
+Stage = Literal["upload", "queue", "decode", "detect", "encode", "store"]
 SECONDS: Final = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 _METHODS: Final = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 _OTHER_IMU_FAULTS: Final = frozenset({"interval_too_long", "mounting_unknown", "no_accelerometer"})
@@ -83,6 +83,11 @@ class ServiceMetrics:
             registry=registry,
             multiprocess_mode="livemax",
         )
+
+    @property
+    def registry(self) -> CollectorRegistry:
+        """For the instruments of a part that not every service has."""
+        return self._registry
 
     def _gauge(self, name: str, help_text: str) -> Gauge:
         return Gauge(name, help_text, registry=self._registry, multiprocess_mode="livesum")

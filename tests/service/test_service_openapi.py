@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import jsonschema
 import pytest
-from service_world import LiveServer
+from rule_detector import RuleDetector
+from service_world import LiveServer, json_request, live_server
 
 from viflow_anomaly_service.examples import EXAMPLE_FAULTS, example_form_request, example_image_png
+from viflow_anomaly_service.store.query import FILTER_NAMES
 
 HTTP_METHODS = {"get", "post", "put", "delete", "patch", "head", "options", "trace"}
 
@@ -60,6 +63,9 @@ def test_operation_ids_are_stable(document: dict[str, Any]) -> None:
         ("/metrics", "get"): "metrics",
         ("/schemas/detection-1.0.json", "get"): "detectionSchema",
         ("/detect", "post"): "detect",
+        ("/detections", "get"): "listDetections",
+        ("/detections.ndjson", "get"): "exportDetections",
+        ("/detections/{detection_id}", "get"): "getDetection",
     }
 
 
@@ -130,6 +136,23 @@ def test_problem_answers_fit_the_documented_schema(server: LiveServer, document:
         server.post_form({"x": ("x", b"1")}),
     ):
         check.validate(response.json())
+
+
+def test_stored_detections_fit_the_documented_schema(document: dict[str, Any], tmp_path: Path) -> None:
+    with live_server(lambda settings: RuleDetector(), store_url=str(tmp_path / "x.db")) as storing:
+        kept = storing.post_json(json_request()).headers["x-detection-id"]
+        answers = {
+            "DetectionPage": storing.client.get("/detections", params={"limit": 1}).json(),
+            "StoredDetection": storing.client.get(f"/detections/{kept}").json(),
+        }
+    for name, answer in answers.items():
+        validator(document, {"$ref": f"#/components/schemas/{name}"}).validate(answer)
+
+
+def test_the_parameters_of_a_list_are_documented(document: dict[str, Any]) -> None:
+    for path, refused in (("/detections", ()), ("/detections.ndjson", ("limit", "cursor"))):
+        documented = {one["name"] for one in document["paths"][path]["get"]["parameters"]}
+        assert documented == {*FILTER_NAMES, "limit", "cursor"} - {*refused}
 
 
 def test_docs_page_is_served(server: LiveServer) -> None:
