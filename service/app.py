@@ -23,6 +23,8 @@ from viflow_anomaly_service.settings import ServiceSettings, load_settings
 from viflow_anomaly_service.state_endpoints import VERSION, add_state
 from viflow_anomaly_service.store.attach import configured_keeper
 from viflow_anomaly_service.store.endpoints import add_detections
+from viflow_anomaly_service.streams.endpoints import add_streams
+from viflow_anomaly_service.streams.table import StreamTable
 
 MEMORY_SECONDS: Final = 5.0
 
@@ -48,7 +50,8 @@ def create_app(
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        tasks = [asyncio.create_task(core.slot.fill()), asyncio.create_task(_watch_memory(core.metrics))]
+        background = (core.slot.fill(), _watch_memory(core.metrics), core.streams.watch())
+        tasks = [asyncio.create_task(one) for one in background]
         core.pool.start()
         if core.keeper is not None:
             core.keeper.start()
@@ -75,6 +78,7 @@ def create_app(
     add_detect(app, core)
     complete_openapi(app)
     add_detections(app, core)
+    add_streams(app, core)
     return app
 
 
@@ -84,13 +88,15 @@ def _build(
     """The one place where the settings' numbers meet the parts."""
     metrics = ServiceMetrics()
     workers = settings.workers_at_once
+    gate = AdmissionGate(places=workers + settings.max_queued, metrics=metrics)
     return ServiceCore(
         settings=settings,
         metrics=metrics,
         slot=DetectorSlot(lambda: load_detector(settings), metrics=metrics, on_failure=on_load_failure),
-        gate=AdmissionGate(places=workers + settings.max_queued, metrics=metrics),
+        gate=gate,
         pool=DetectorPool(workers=workers, metrics=metrics),
         keeper=configured_keeper(settings, metrics),
+        streams=StreamTable(settings, gate, metrics),
     )
 
 

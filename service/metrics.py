@@ -65,11 +65,11 @@ class ServiceMetrics:
             registry=registry,
         )
         # Of live processes only: what a process that ended had in hand is gone with it.
-        self.queue_depth = self._gauge("viflow_queue_depth", "Requests that wait for a worker thread")
-        self.in_flight = self._gauge("viflow_requests_in_flight", "Requests inside: uploading, waiting, being judged")
-        self.workers_busy = self._gauge("viflow_workers_busy", "Worker threads that judge a pair")
-        self.workers = self._gauge("viflow_workers", "Worker threads")
-        self.ready = self._gauge("viflow_ready_processes", "Processes whose model is loaded")
+        self.queue_depth = self.gauge("viflow_queue_depth", "Requests that wait for a worker thread")
+        self.in_flight = self.gauge("viflow_requests_in_flight", "Requests inside: uploading, waiting, being judged")
+        self.workers_busy = self.gauge("viflow_workers_busy", "Worker threads that judge a pair")
+        self.workers = self.gauge("viflow_workers", "Worker threads")
+        self.ready = self.gauge("viflow_ready_processes", "Processes whose model is loaded")
         self._resident = Gauge(
             "viflow_resident_memory_bytes",
             "Memory of a process, pages it shares with others included",
@@ -89,7 +89,7 @@ class ServiceMetrics:
         """For the instruments of a part that not every service has."""
         return self._registry
 
-    def _gauge(self, name: str, help_text: str) -> Gauge:
+    def gauge(self, name: str, help_text: str) -> Gauge:
         return Gauge(name, help_text, registry=self._registry, multiprocess_mode="livesum")
 
     def observe_stage(self, stage: Stage, seconds: float) -> None:

@@ -10,6 +10,7 @@ from viflow_anomaly_service.detector_pool import DetectorPool
 from viflow_anomaly_service.detector_slot import DetectorSlot
 from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.settings import ServiceSettings
+from viflow_anomaly_service.streams.table import StreamTable
 
 if TYPE_CHECKING:
     from viflow_anomaly_service.store.keeper import ResultKeeper
@@ -26,6 +27,7 @@ class ServiceCore:
         gate: who may come in.
         pool: who does the work.
         keeper: where detections stay; None: nowhere.
+        streams: what is remembered between frames.
     """
 
     settings: ServiceSettings
@@ -34,3 +36,4 @@ class ServiceCore:
     gate: AdmissionGate
     pool: DetectorPool
     keeper: ResultKeeper | None
+    streams: StreamTable
