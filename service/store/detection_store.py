@@ -14,7 +14,7 @@ from typing import Any, Final
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from viflow_anomaly_service.store.engine import make_engine, migrate, store_url
+from viflow_anomaly_service.store.engine import UNTIL, make_engine, migrate, store_url
 from viflow_anomaly_service.store.failures import store_failures
 from viflow_anomaly_service.store.query import DetectionFilter, PageRequest
 from viflow_anomaly_service.store.record import Record, StoredDetection, first_id_at
@@ -135,6 +135,7 @@ class DetectionStore:
             deleted += self._delete_before(self._first_kept(max_bytes))
         if deleted and self._engine.dialect.name == "sqlite":
             with store_failures(), contextlib.closing(self._engine.raw_connection()) as connection:
+                connection.info.pop(UNTIL, None)
                 # executescript runs it to its end; execute would free one page
                 connection.cursor().executescript(f"PRAGMA incremental_vacuum({_VACUUMED_PAGES})")
         return deleted

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,6 +22,9 @@ MIGRATIONS: Final = Path(__file__).parent / "migrations"
 CONNECT_SECONDS: Final = 3
 STATEMENT_SECONDS: Final = 10
 CONNECTIONS: Final = 4
+UNTIL: Final = "until"
+"""Among what is known of an SQLite connection: on the monotonic clock, when its transaction takes too long."""
+_STEPS_A_LOOK: Final = 100_000
 _MIGRATION_LOCK: Final = 0x7669666C6F77  # any number that nobody else takes
 _SQLITE_PRAGMAS: Final = (
     f"PRAGMA busy_timeout={STATEMENT_SECONDS * 1000}",
@@ -81,13 +86,16 @@ def _own_sqlite_transactions(engine: Engine) -> None:
     """Python's driver begins transactions late, which lets two writers fail where one should wait."""
 
     @sa.event.listens_for(engine, "connect")
-    def on_connect(connection: Any, record: object) -> None:
+    def on_connect(connection: Any, record: Any) -> None:
         connection.isolation_level = None
         for pragma in _SQLITE_PRAGMAS:
             connection.execute(pragma).close()
+        known = record.info
+        connection.set_progress_handler(lambda: time.monotonic() > known.get(UNTIL, math.inf), _STEPS_A_LOOK)
 
     @sa.event.listens_for(engine, "begin")
     def on_begin(connection: Connection) -> None:
+        connection.info[UNTIL] = time.monotonic() + STATEMENT_SECONDS
         writes = connection.get_execution_options().get("writes", False)
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
@@ -104,6 +112,8 @@ def migrate(engine: Engine) -> None:
     with engine.connect().execution_options(writes=True) as connection, connection.begin():
         if engine.dialect.name == "postgresql":
             connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_MIGRATION_LOCK)))
+            connection.execute(sa.text("SET LOCAL statement_timeout = 0"))  # a large table may take its time
+        connection.info.pop(UNTIL, None)
         config.attributes["connection"] = connection
         try:
             if not _is_newest(connection, config):

@@ -19,6 +19,7 @@ _SQLITE: Final = {
     "SQLITE_READONLY": "store_read_only",
     "SQLITE_BUSY": "store_busy",
     "SQLITE_LOCKED": "store_busy",
+    "SQLITE_INTERRUPT": "store_busy",
     "SQLITE_CORRUPT": "store_corrupt",
     "SQLITE_NOTADB": "store_corrupt",
 }

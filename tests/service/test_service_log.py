@@ -16,11 +16,14 @@ from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.request_log import RequestLogMiddleware
 
 
-def request_lines(caplog: pytest.LogCaptureFixture, *, expected: int = 2) -> list[dict[str, Any]]:
-    """The lines of the answered requests; a line may follow its answer by a moment."""
+def request_lines(
+    caplog: pytest.LogCaptureFixture, *, expected: int = 2, earlier: tuple[str, ...] = ("abc",)
+) -> list[dict[str, Any]]:
+    """The lines of the answered requests, without those of ids that another test used: a line follows its answer."""
     deadline = time.monotonic() + 10.0
     while time.monotonic() < deadline:
-        records = [record for record in caplog.records if record.getMessage() == "request"]
+        lines = [record for record in caplog.records if record.getMessage() == "request"]
+        records = [record for record in lines if vars(record)["request_id"] not in earlier]
         if len(records) >= expected:
             break
         time.sleep(0.01)

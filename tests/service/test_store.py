@@ -272,6 +272,17 @@ def test_a_writer_waits_for_another(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     store.close()
 
 
+def test_a_search_that_takes_too_long_ends(store: DetectionStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    endless = "WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n) SELECT count(*) FROM n"
+    monkeypatch.setattr("viflow_anomaly_service.store.engine.STATEMENT_SECONDS", 1)
+    engine = make_engine(store._url)
+    with engine.connect() as connection, pytest.raises(StoreError) as caught, store_failures():
+        connection.execute(sa.text(endless))
+    assert caught.value.code == "store_busy"
+    engine.dispose()
+    store.add([record()])
+
+
 @pytest.mark.parametrize(
     "text",
     ["mysql://u:secret@h/d", "sqlite://", "sqlite:///:memory:", "postgresql://u:secret@h:port/d", "http://x", ""],

@@ -18,6 +18,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from rule_detector import RuleDetector
 from service_world import LiveServer, assert_problem, base64_text, live_server, png, wait_until
+from serving_process import ServingProcess, serving_process
 from worlds import World, make_world
 
 from viflow_anomaly.config import MotorSource
@@ -422,3 +423,43 @@ def test_no_stamps_break_a_stream(streaming: LiveServer, world: World, calls: li
         answer = post(streaming, "fuzz", body)
         assert answer.status_code in (200, 422), answer.text
     streaming.client.delete("/streams/fuzz")
+
+
+def test_a_kill_loses_no_detection_of_a_stream_that_was_answered(empty_store_url: str, world: World) -> None:
+    acknowledged: dict[str, Any] = {}
+    enough = threading.Event()
+
+    def fly(serving: ServingProcess, name: str) -> None:
+        step_ns = int(world.frame_timestamps_ns[1] - world.frame_timestamps_ns[0])
+        with serving.client() as client:
+            for k in range(10_000):
+                stamp = k * step_ns
+                stamps = list(range(stamp - 9 * step_ns // 10, stamp + 1, step_ns // 10))
+                image = base64_text(png(world.images[k % FRAMES]))
+                samples = {"timestamps_ns": stamps, "gyro_rad_s": [[0.0, 0.0, 0.1]] * len(stamps)}
+                body = {"frame": {"timestamp_ns": stamp, "image_base64": image}, "imu": samples}
+                try:
+                    answer = client.post(f"/streams/{name}/frames", json=body)
+                except httpx.TransportError:
+                    return
+                assert answer.status_code == 200, answer.text
+                found = answer.json()
+                acknowledged.update(zip(found["detection_ids"], found["detections"], strict=True))
+                if len(acknowledged) >= 30:
+                    enough.set()
+
+    with serving_process(store_url=empty_store_url) as serving, ThreadPoolExecutor(3) as clients:
+        with serving.client() as client:
+            wait_until(lambda: client.get("/readyz").status_code == 200, seconds=20)
+        running = [clients.submit(fly, serving, name) for name in "abc"]
+        assert enough.wait(60)
+        serving.process.kill()
+        for one in running:
+            one.result()
+    with serving_process(store_url=empty_store_url) as again, again.client() as client:
+        wait_until(lambda: client.get("/readyz").status_code == 200, seconds=20)
+        lines = client.get("/detections.ndjson").text.splitlines()
+        stored = {one["id"]: one for one in map(json.loads, lines)}
+        assert acknowledged.items() <= {name: one["detection"] for name, one in stored.items()}.items()
+        assert {one["stream_id"] for one in stored.values()} == {"a", "b", "c"}
+        assert client.get("/streams").json() == {"streams": []}
