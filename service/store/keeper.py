@@ -214,7 +214,10 @@ class ResultKeeper:
     async def _watch(self) -> None:
         """Write now and then, so that a failure is known before a request meets it; often while there is one."""
         while True:
-            await self._write(self._store.probe)
+            try:
+                await self._write(self._store.probe)
+            except Exception:  # a fault of ours, which must not end the watch
+                logger.exception("store_watch_failed")
             for _ in range(RETRIES_A_PROBE):
                 await asyncio.sleep(RETRY_SECONDS)
                 if self._failure is not None:
@@ -228,6 +231,8 @@ class ResultKeeper:
                     deleted = await self._read(lambda: self._store.prune(max_age_s=age_s, max_bytes=size))
                 except Problem as problem:
                     logger.warning("store_not_pruned", extra={"code": problem.code})
+                except Exception:  # as above
+                    logger.exception("store_not_pruned")
                 else:
                     self._metrics.pruned.inc(deleted)
                     if deleted:

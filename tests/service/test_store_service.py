@@ -35,6 +35,9 @@ from viflow_anomaly.errors import MissingDependencyError
 from viflow_anomaly_service.app import create_app
 from viflow_anomaly_service.settings import ServiceSettings
 from viflow_anomaly_service.store import keeper as keeper_module
+from viflow_anomaly_service.store.detection_store import DetectionStore
+from viflow_anomaly_service.store.failures import store_error
+from viflow_anomaly_service.store.query import PageRequest
 
 
 @pytest.fixture
@@ -59,6 +62,16 @@ def test_an_answer_can_be_read_again(storing: LiveServer) -> None:
     one = storing.client.get(f"/detections/{ids[2]}").json()
     assert one == page["detections"][2]
     assert (one["stream_id"], one["session_id"]) == (None, None)
+
+
+def test_replicas_share_a_store(empty_store_url: str) -> None:
+    with (
+        live_server(lambda settings: RuleDetector(), store_url=empty_store_url) as one,
+        live_server(lambda settings: RuleDetector(), store_url=empty_store_url) as other,
+    ):
+        ids = [server.post_json(json_request()).headers["x-detection-id"] for server in (one, other) * 3]
+        for server in (one, other):
+            assert {found["id"] for found in listed(server)["detections"]} == set(ids)
 
 
 def test_pages_and_export_give_everything_once(storing: LiveServer, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,6 +165,26 @@ def test_without_the_packages_the_error_names_the_extra(monkeypatch: pytest.Monk
     create_app(ServiceSettings())
     with pytest.raises(MissingDependencyError, match=r"viflow-anomaly\[store\]"):
         create_app(ServiceSettings(store_url=str(tmp_path / "x.db")))
+
+
+def test_an_export_that_breaks_off_is_no_whole_answer(
+    no_store_needed: LiveServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("viflow_anomaly_service.store.endpoints.EXPORT_ROWS", 1)
+    for seed in range(3):
+        no_store_needed.post_json(json_request(seed=seed))
+    whole, read = DetectionStore.page, [0]
+
+    def page(self: DetectionStore, request: PageRequest) -> Any:
+        read[0] += 1
+        if read[0] == 2:
+            raise store_error("store_unavailable")
+        return whole(self, request)
+
+    monkeypatch.setattr(DetectionStore, "page", page)
+    with pytest.raises(httpx.RemoteProtocolError):
+        no_store_needed.client.get("/detections.ndjson")
+    assert no_store_needed.client.get("/detections.ndjson").status_code == 200
 
 
 def test_metrics_count_what_is_stored(storing: LiveServer) -> None:
