@@ -2,7 +2,7 @@
 
 Each part's numbers come from one run, as ratios: throughput of 16 clients over the pipeline without a service (rounds
 alternate), the slowest answers over the median at half of saturation, memory late over early. The pairs are the bundled
-sample as JPEG, resized, posted as multipart/form-data.
+sample as JPEG, resized, posted as multipart/form-data or JSON.
 
     python benchmarks/service_load.py --out benchmarks/results/service-load.json
 """
@@ -28,8 +28,8 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-import cv2
 import numpy as np
+from load_bodies import BODIES, head, request_parts
 
 from viflow_anomaly.allocator import keep_freed_memory
 from viflow_anomaly.checkpoint_record import source_commit, write_atomically
@@ -42,7 +42,6 @@ from viflow_anomaly_service.settings import load_settings
 
 ROOT = Path(__file__).resolve().parents[1]
 CLIENT = Path(__file__).with_name("load_client.py")
-BOUNDARY = "viflow-load"
 EARLY_REQUESTS = 500
 WARM_UP_REQUESTS = 40
 OVERLOAD_CLIENTS = 120
@@ -121,46 +120,27 @@ def _port(log: Path, process: subprocess.Popen[bytes]) -> int:
     raise SystemExit(f"error: the service ended with status {process.returncode}: {log.read_text(encoding='utf-8')}")
 
 
-def request_parts(sample: Path, width: int, height: int) -> tuple[bytes, bytes]:
-    """A request's head and its multipart body: the sample's pair, resized, with its camera."""
-    request = json.loads((sample / "request.json").read_text(encoding="utf-8"))
-    parts: list[tuple[str, bytes]] = []
-    camera = request["camera"]
-    scale_x, scale_y = width / camera["width"], height / camera["height"]
-    camera |= {"fx": camera["fx"] * scale_x, "fy": camera["fy"] * scale_y, "width": width, "height": height}
-    camera |= {"cx": (camera["cx"] + 0.5) * scale_x - 0.5, "cy": (camera["cy"] + 0.5) * scale_y - 0.5}
-    for name in ("source", "target"):
-        image = cv2.imread(str(sample / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
-        if image is None:
-            raise SystemExit(f"error: {sample / name}.png: expected an image")
-        resized = cv2.resize(image, (width, height), interpolation=cv2.INTER_CUBIC)
-        parts.append((name, cv2.imencode(".jpg", resized, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()))
-    parts += [("imu", (sample / "imu.json").read_bytes()), ("request", json.dumps(request).encode())]
-    body = b"".join(
-        f'--{BOUNDARY}\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n'.encode() + content + b"\r\n"
-        for name, content in parts
-    )
-    body += f"--{BOUNDARY}--\r\n".encode()
-    head = (
-        "POST /detect HTTP/1.1\r\nHost: localhost\r\n"
-        f"Content-Type: multipart/form-data; boundary={BOUNDARY}\r\nContent-Length: {len(body)}\r\n\r\n"
-    )
-    return head.encode(), body
-
-
 class Pipeline:
     """The same work without a service: body -> pair -> detection -> JSON, in as many threads as the service has."""
 
-    def __init__(self, body: bytes) -> None:
+    def __init__(self, content_type: str, body: bytes) -> None:
         self._settings = load_settings()
         self._detector = load_bundled_or_configured(self._settings)
         self._body = body
-        self._content_type = f"multipart/form-data; boundary={BOUNDARY}"
+        self._content_type = content_type
         self._threads = len(os.sched_getaffinity(0))
 
     def once(self) -> str:
         pair, config, _ = read_pair(self._detector, self._body, self._content_type, self._settings)
         return to_json(self._detector.with_config(config).detect(pair))
+
+    def latencies(self, seconds: float) -> list[float]:
+        """Seconds of one pair after the other, in one thread."""
+        times, until = [], time.perf_counter() + seconds
+        while (started := time.perf_counter()) < until:
+            self.once()
+            times.append(time.perf_counter() - started)
+        return times
 
     def rate(self, seconds: float) -> float:
         """Pairs a second."""
@@ -202,8 +182,12 @@ def throughput(service: Service, pipeline: Pipeline, *, rounds: int, seconds: fl
     }
 
 
-def half_load(service: Service, saturation: float, seconds: float) -> dict[str, Any]:
-    """Latencies at half of saturation, arrivals at random."""
+def half_load(service: Service, pipeline: Pipeline, saturation: float, seconds: float) -> dict[str, Any]:
+    """Latencies at half of saturation, arrivals at random; beside them the pipeline's own, pair after pair, alone.
+
+    The latter is what the machine's other work makes of one and the same computation.
+    """
+    alone = np.percentile(pipeline.latencies(seconds / 4), (50, 99))
     run = service.load("detect", clients=32, rate=saturation / 2, seconds=seconds)
     times = np.array([taken for _, taken, status in run["answers"] if status == 200]) * 1e3
     p50, p90, p99 = (float(value) for value in np.percentile(times, (50, 90, 99)))
@@ -215,6 +199,7 @@ def half_load(service: Service, saturation: float, seconds: float) -> dict[str, 
         "p90_ms": round(p90, 1),
         "p99_ms": round(p99, 1),
         "p99_over_p50": round(p99 / p50, 2),
+        "alone_p99_over_p50": round(float(alone[1] / alone[0]), 2),
         "goal": "p99_over_p50 <= 3",
     }
 
@@ -246,7 +231,7 @@ def overload(service: Service, saturation: float, seconds: float, calm_ms: float
 
 
 def memory(service: Service, *, requests: int) -> dict[str, Any]:
-    """Resident memory late over early; everything before counts as having happened."""
+    """Resident memory late over early, of a service that has done nothing else."""
     early = service.load("detect", clients=4, requests=EARLY_REQUESTS)
     before = service.resident_mib()
     late = service.load("detect", clients=4, requests=requests - EARLY_REQUESTS)
@@ -277,10 +262,11 @@ def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="The HTTP service under load.")
     parser.add_argument("--sample", type=Path, default=ROOT / "samples" / "drone", help="a pair as in samples/drone")
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "service-load.json")
-    parser.add_argument("--size", default="752x480", help="WIDTHxHEIGHT of the pairs (default 752x480)")
+    parser.add_argument("--size", default="720x480", help="WIDTHxHEIGHT of the pairs (default 720x480)")
+    parser.add_argument("--body", choices=sorted(BODIES), default="form", help="how the pairs are sent (default form)")
     parser.add_argument("--workers", type=int, default=1, help="processes of the service (default 1)")
     parser.add_argument("--rounds", type=int, default=5, help="of throughput, each way (default 5)")
-    parser.add_argument("--seconds", type=float, default=10.0, help="of a round; of the others twice that (default 10)")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of a round (default 10)")
     parser.add_argument("--requests", type=int, default=20_000, help="of the memory part; 0 leaves it out")
     arguments = parser.parse_args()
     if 0 < arguments.requests <= EARLY_REQUESTS:
@@ -292,18 +278,27 @@ def main() -> None:
     arguments = parse_arguments()
     keep_freed_memory()  # as the service does
     width, height = (int(side) for side in arguments.size.split("x"))
-    head, body = request_parts(arguments.sample, width, height)
+    content_type, make_body = BODIES[arguments.body]
+    body = make_body(*request_parts(arguments.sample, width, height))
     report: dict[str, Any] = circumstances()
-    report |= {"width": width, "height": height, "body_bytes": len(body), "workers": arguments.workers}
-    pipeline = Pipeline(body)
+    report |= {
+        "width": width,
+        "height": height,
+        "body": arguments.body,
+        "body_bytes": len(body),
+        "workers": arguments.workers,
+    }
+    pipeline = Pipeline(content_type, body)
     with running_service(arguments.workers) as service:
-        (service.folder / "detect").write_bytes(head + body)
+        (service.folder / "detect").write_bytes(head(content_type, body) + body)
         twice = 2 * arguments.seconds
         report["throughput"] = throughput(service, pipeline, rounds=arguments.rounds, seconds=arguments.seconds)
         saturation = report["throughput"]["served_pairs_s"]
-        report["half_load"] = half_load(service, saturation, twice)
+        report["half_load"] = half_load(service, pipeline, saturation, 2 * twice)
         report["overload"] = overload(service, saturation, twice, report["half_load"]["p50_ms"])
-        if arguments.requests:
+    if arguments.requests:
+        with running_service(arguments.workers) as service:
+            (service.folder / "detect").write_bytes(head(content_type, body) + body)
             report["memory"] = memory(service, requests=arguments.requests)
     report["load_1min_after"] = round(os.getloadavg()[0], 2)
     write_atomically(arguments.out, (json.dumps(report, indent=2) + "\n").encode())

@@ -5,13 +5,15 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Any, Final
 
 from fastapi import FastAPI
 
+from viflow_anomaly.pair_detector import PairDetector
 from viflow_anomaly_service.admission import AdmissionGate
 from viflow_anomaly_service.detect_endpoint import add_detect
-from viflow_anomaly_service.detector_loading import DetectorLoader, load_bundled_or_configured
+from viflow_anomaly_service.detector_loading import DetectorLoader, load_bundled_or_configured, warm_up
 from viflow_anomaly_service.detector_pool import DetectorPool
 from viflow_anomaly_service.detector_slot import DetectorSlot
 from viflow_anomaly_service.metrics import ServiceMetrics
@@ -50,9 +52,9 @@ def create_app(
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        core.pool.start()
         background = (core.slot.fill(), _watch_memory(core.metrics), core.streams.watch())
         tasks = [asyncio.create_task(one) for one in background]
-        core.pool.start()
         if core.keeper is not None:
             core.keeper.start()
         yield
@@ -89,12 +91,20 @@ def _build(
     metrics = ServiceMetrics()
     workers = settings.workers_at_once
     gate = AdmissionGate(places=workers + settings.max_queued, metrics=metrics)
+    pool = DetectorPool(workers=workers, metrics=metrics)
+
+    async def warm_up_everywhere(detector: PairDetector) -> None:
+        for camera in settings.warm_up:
+            await pool.run_everywhere(partial(warm_up, detector, camera))
+
     return ServiceCore(
         settings=settings,
         metrics=metrics,
-        slot=DetectorSlot(lambda: load_detector(settings), metrics=metrics, on_failure=on_load_failure),
+        slot=DetectorSlot(
+            lambda: load_detector(settings), prepare=warm_up_everywhere, metrics=metrics, on_failure=on_load_failure
+        ),
         gate=gate,
-        pool=DetectorPool(workers=workers, metrics=metrics),
+        pool=pool,
         keeper=configured_keeper(settings, metrics),
         streams=StreamTable(settings, gate, metrics),
     )

@@ -1,4 +1,4 @@
-"""From settings to a detector that answers its first pair as fast as any later one."""
+"""From settings to a detector, and what makes its first pair as fast as any later one."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 
 from viflow_anomaly.errors import InvalidInputError
 from viflow_anomaly.pair_detector import PairDetector
-from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples
-from viflow_anomaly_service.settings import ServiceSettings
+from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples, PinholeCamera
+from viflow_anomaly_service.settings import ServiceSettings, WarmUpCamera
 
 logger = logging.getLogger(__name__)
 
@@ -26,7 +26,7 @@ PRELOADED: Final = ("cv2", "skimage.measure", "viflow_anomaly.alarm_calibration"
 
 
 def load_bundled_or_configured(settings: ServiceSettings) -> PairDetector:
-    """The detector that the settings name, warm; sets how many threads the network and OpenCV use in this process.
+    """The detector that the settings name; sets how many threads the network and OpenCV use in this process.
 
     Raises:
         CheckpointError: the checkpoint cannot be used.
@@ -48,10 +48,7 @@ def load_bundled_or_configured(settings: ServiceSettings) -> PairDetector:
         precision=settings.precision,
         network_precision=settings.network_precision,
     )
-    ready = calibrated(detector, settings.calibration)
-    for width, height in settings.warm_up_sizes:
-        warm_up(ready, width=width, height=height)
-    return ready
+    return calibrated(detector, settings.calibration)
 
 
 def preload() -> None:
@@ -60,23 +57,24 @@ def preload() -> None:
         import_module(name)
 
 
-def warm_up(detector: PairDetector, *, width: int, height: int) -> None:
+def warm_up(detector: PairDetector, camera: WarmUpCamera) -> None:
     """Judge one made-up pair: networks are compiled for a size when they first meet it, and modules are imported.
 
     A model that does not take such a pair (one with a motor input) stays cold; that is no fault.
     """
     started = time.perf_counter()
     try:
-        detector.detect(example_pair(width=width, height=height))
+        detector.detect(example_pair(camera))
     except InvalidInputError as err:
-        logger.warning("not_warmed_up", extra={"width": width, "height": height, "reason": err.message})
+        logger.warning("not_warmed_up", extra={"camera": str(camera), "reason": err.message})
         return
     spent_ms = round((time.perf_counter() - started) * 1e3, 1)
-    logger.info("warmed_up", extra={"width": width, "height": height, "duration_ms": spent_ms})
+    logger.info("warmed_up", extra={"camera": str(camera), "duration_ms": spent_ms})
 
 
-def example_pair(*, width: int, height: int) -> FramePair:
+def example_pair(camera: WarmUpCamera) -> FramePair:
     """Texture that moves by a pixel, and an IMU at rest."""
+    width, height = camera.width, camera.height
     coarse = np.random.default_rng(0).integers(60, 196, (height // 8 + 2, width // 8 + 2), dtype=np.uint8)
     texture = np.kron(coarse, np.ones((8, 8), dtype=np.uint8))
     images = (np.ascontiguousarray(texture[:height, shift : width + shift]) for shift in (0, 1))
@@ -84,4 +82,8 @@ def example_pair(*, width: int, height: int) -> FramePair:
     stamps = np.arange(0, 40 * INTERVAL_NS, IMU_STEP_NS, dtype=np.int64)
     at_rest = np.tile((0.0, 0.0, 9.81), (len(stamps), 1))
     imu = ImuSamples(timestamps_ns=stamps, gyro_rad_s=np.zeros((len(stamps), 3)), accel_m_s2=at_rest)
-    return FramePair(source=source, target=target, imu=imu)
+    seen_by = None
+    if (focal_px := camera.focal_px) is not None:
+        cx, cy = (width - 1) / 2, (height - 1) / 2
+        seen_by = PinholeCamera(fx=focal_px, fy=focal_px, cx=cx, cy=cy, width=width, height=height)
+    return FramePair(source=source, target=target, imu=imu, camera=seen_by)

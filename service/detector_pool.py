@@ -22,6 +22,7 @@ logger = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
 JOIN_SECONDS: Final = 10.0
+MEET_SECONDS: Final = 60.0
 
 
 class DeadlinePassedError(Exception):
@@ -128,7 +129,18 @@ class DetectorPool:
             return await job.done
         finally:
             job.abandoned = True
+            job.done.cancel()  # an error that comes now is nobody's, not even the loop's to complain of
             self._withdraw(job)
+
+    async def run_everywhere(self, work: Callable[[], None]) -> None:
+        """Call ``work`` once in every worker's thread, at the same time; only while nobody else is in the line."""
+        together = threading.Barrier(len(self._threads))
+
+        def meet(job: Job[None]) -> None:
+            together.wait(MEET_SECONDS)
+            work()
+
+        await asyncio.gather(*(self.run(meet, within_s=MEET_SECONDS) for _ in self._threads))
 
     def close(self) -> None:
         """Let the workers finish what they do, and wait for them, though not for ever."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 from viflow_anomaly.pair_detector import PairDetector
@@ -19,14 +19,21 @@ class DetectorSlot:
 
     Args:
         load: makes the detector; called once.
+        prepare: called once with it, before anybody else may use it.
         metrics: told which model it is, once it is there.
         on_failure: told when it could not be made; the slot then stays empty.
     """
 
     def __init__(
-        self, load: Callable[[], PairDetector], *, metrics: ServiceMetrics, on_failure: Callable[[Exception], Any]
+        self,
+        load: Callable[[], PairDetector],
+        *,
+        prepare: Callable[[PairDetector], Awaitable[None]],
+        metrics: ServiceMetrics,
+        on_failure: Callable[[Exception], Any],
     ) -> None:
         self._load = load
+        self._prepare = prepare
         self._metrics = metrics
         self._on_failure = on_failure
         self._detector: PairDetector | None = None
@@ -39,13 +46,15 @@ class DetectorSlot:
     async def fill(self) -> None:
         """Load; never raises, because nobody awaits it before the process ends."""
         try:
-            self._detector = await asyncio.to_thread(self._load)
+            detector = await asyncio.to_thread(self._load)
+            await self._prepare(detector)
         except Exception as err:
             self._failed = True
             logger.exception("model_load_failed")
             self._on_failure(err)
         else:
-            model = self._detector.model_info
+            self._detector = detector
+            model = detector.model_info
             self._metrics.observe_model(model)
             logger.info("model_loaded", extra={"model": model.name, "model_version": model.version})
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, NonNegativeInt, PositiveFloat, PositiveInt, SecretStr, ValidationError
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict, SettingsError
@@ -25,24 +25,42 @@ from viflow_anomaly.settings import ENVIRONMENT_PREFIX, SERVICE_SETTINGS, refuse
 
 MEBIBYTE = 1024 * 1024
 MAX_WORKERS: Final = 256
-_SIZE: Final = re.compile(r"([1-9]\d{1,4})x([1-9]\d{1,4})")
+_CAMERA: Final = re.compile(
+    r"(?P<width>[1-9]\d{1,4})x(?P<height>[1-9]\d{1,4})(@(?P<focal>[1-9]\d{0,5}(\.\d+)?))?", re.ASCII
+)
 
 
 def _usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _sizes(value: Any) -> Any:
-    """``"752x480,640x480"`` as pairs of numbers; anything else as it is."""
+class WarmUpCamera(NamedTuple):
+    """The size of a camera's images in pixels and its focal length, None: such images come without a calibration."""
+
+    width: int
+    height: int
+    focal_px: float | None
+
+    def __str__(self) -> str:
+        return f"{self.width}x{self.height}" + ("" if self.focal_px is None else f"@{self.focal_px:g}")
+
+
+def _cameras(value: Any) -> Any:
+    """``"752x480@458,640x480"`` as cameras; anything else as it is."""
     if not isinstance(value, str):
         return value
-    found = [_SIZE.fullmatch(text.strip()) for text in value.split(",") if text.strip()]
+    found = [_CAMERA.fullmatch(text.strip()) for text in value.split(",") if text.strip()]
     if None in found:
-        raise ValueError(f"expected sizes such as 752x480,640x480, found {value!r:.80}")
-    return tuple((int(size[1]), int(size[2])) for size in found if size is not None)
+        raise ValueError(f"expected WIDTHxHEIGHT or WIDTHxHEIGHT@FOCAL, such as 752x480@458, found {value!r:.80}")
+    return tuple(
+        WarmUpCamera(int(one["width"]), int(one["height"]), float(one["focal"]) if one["focal"] else None)
+        for one in found
+        if one is not None
+    )
 
 
-Sizes = Annotated[tuple[tuple[int, int], ...], NoDecode, BeforeValidator(_sizes)]
+Cameras = Annotated[tuple[WarmUpCamera, ...], NoDecode, BeforeValidator(_cameras)]
+_EUROC: Final = (WarmUpCamera(752, 480, None), WarmUpCamera(752, 480, 458.0))
 
 
 class ServiceSettings(BaseSettings):
@@ -82,7 +100,7 @@ class ServiceSettings(BaseSettings):
     queue_timeout_s: PositiveFloat = Field(default=10.0, description="longest wait for a turn")
     body_timeout_s: PositiveFloat = Field(default=30.0, description="longest upload")
     shutdown_timeout_s: PositiveInt = Field(default=20, description="time for running requests after SIGTERM")
-    warm_up_sizes: Sizes = Field(default=((752, 480),), description="WIDTHxHEIGHT of pairs judged before it is ready")
+    warm_up: Cameras = Field(default=_EUROC, description="WIDTHxHEIGHT[@FOCAL] of what is judged before it is ready")
     store_url: SecretStr | None = Field(
         default=None, description="where detections stay: a path or sqlite:////path, or postgresql://...; none: nowhere"
     )

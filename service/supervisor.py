@@ -36,6 +36,7 @@ RESTART_SECONDS: Final = 1.0
 LOOK_SECONDS: Final = 0.2
 KILL_AFTER_SECONDS: Final = 15
 """Beyond the time that a process takes to end in order: upload, farewell, workers that finish their pair."""
+MEMORY_FOLDER: Final = "/dev/shm"  # noqa: S108 - the folder made in it is the process's own
 _PR_SET_PDEATHSIG: Final = 1
 
 
@@ -44,7 +45,7 @@ def supervise(settings: ServiceSettings, load_detector: DetectorLoader | None, s
 
     Raises:
         ConfigError: ``address_unavailable``; ``workers_unsupported`` on another system than Linux; ``workers_failed``:
-            a process could not use its settings or checkpoint (its own message is on stderr), or did not end.
+            a process could not start (its own message is on stderr), or did not end.
     """
     if sys.platform != "linux":
         raise ConfigError(
@@ -56,12 +57,16 @@ def supervise(settings: ServiceSettings, load_detector: DetectorLoader | None, s
         host, port = alone.getsockname()[:2]
     with (
         socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as reserved,
-        tempfile.TemporaryDirectory(prefix="viflow-metrics-") as metrics_folder,
+        tempfile.TemporaryDirectory(prefix="viflow-metrics-", dir=_memory_folder()) as metrics_folder,
     ):
         reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         reserved.bind((host, port))  # holds the address while processes come and go; it does not listen
         log_address(reserved, workers=settings.workers)
         settings = settings.model_copy(update={"host": host, "port": port})
+        if "prometheus_client" in sys.modules:
+            raise AssertionError(
+                "prometheus_client was imported before it could learn that processes share its numbers"
+            )
         os.environ["PROMETHEUS_MULTIPROC_DIR"] = metrics_folder
         if load_detector is None:
             from viflow_anomaly_service.detector_loading import preload  # noqa: PLC0415 - heavy
@@ -72,6 +77,11 @@ def supervise(settings: ServiceSettings, load_detector: DetectorLoader | None, s
         gc.collect()
         gc.freeze()  # a collection in a process would else copy every page it looks at
         Supervisor(settings, load_detector, stop).run()
+
+
+def _memory_folder() -> str | None:
+    """Where the numbers of all processes lie: in memory, which can be written to in a read-only container, too."""
+    return MEMORY_FOLDER if os.access(MEMORY_FOLDER, os.W_OK) else None
 
 
 class Supervisor:
@@ -94,7 +104,7 @@ class Supervisor:
             failed = self._bury()
         ended = self._end()
         if failed or not ended:
-            found = "one that could not use its settings or its model" if failed else "one that had to be killed"
+            found = "one that could not start" if failed else "one that had to be killed"
             raise ConfigError(
                 f"workers: expected {self._settings.workers} processes that serve and end in order, found {found}",
                 code="workers_failed",
@@ -119,7 +129,7 @@ class Supervisor:
             mark_process_dead(process.pid)  # type: ignore[no-untyped-call]
             if not self._stop.requested:
                 logger.error("worker_died", extra={"worker": process.pid, "exit_status": process.exitcode})
-        if any(process.exitcode == EXIT_BAD_INPUT for process in dead):
+        if any((process.exitcode or 0) > 0 for process in dead):  # a signal's status is negative
             return True
         if dead and not self._stop.requested:
             time.sleep(RESTART_SECONDS)  # one that dies at once shall not keep the machine busy with starting it

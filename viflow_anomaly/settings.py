@@ -50,7 +50,7 @@ SERVICE_SETTINGS = (
     "queue_timeout_s",
     "body_timeout_s",
     "shutdown_timeout_s",
-    "warm_up_sizes",
+    "warm_up",
     "store_url",
     "store_max_age_s",
     "store_max_bytes",

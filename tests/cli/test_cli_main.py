@@ -275,3 +275,18 @@ def test_serve_refuses_bad_settings(ask: Ask, monkeypatch: pytest.MonkeyPatch) -
     assert ask(["serve", "--port", "70000"]).is_refusal("Invalid value for '--port'")
     monkeypatch.setenv("VIFLOW_MAX_CONCURRENT", "0")
     assert ask(["serve"]).is_refusal("[config_invalid]")
+
+
+def test_serve_takes_its_own_table_of_the_file(ask: Ask, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    stand_in(monkeypatch, "viflow_anomaly_service.server", run=asked.append)
+    file = tmp_path / "service.toml"
+    file.write_text('threads = 2\n[service]\nworkers = 3\nmax_queued = 9\nwarm_up = "64x48"\n')
+    assert ask(["serve", "--config", str(file), "--workers", "4"]).code == 0
+    settings = asked[0]
+    assert (settings.threads, settings.workers, settings.max_queued, settings.warm_up) == (2, 4, 9, ((64, 48, None),))
+    assert ask(["config", "--config", str(file)]).code == 0
+    file.write_text("[service]\nmax_queue = 9\n")
+    assert ask(["serve", "--config", str(file)]).is_refusal("configuration file, [service]: expected host")
+    file.write_text("service = 9\n")
+    assert ask(["serve", "--config", str(file)]).is_refusal("expected a table [service], found int")

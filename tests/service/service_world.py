@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import contextlib
 import json
@@ -94,6 +95,7 @@ class LiveServer:
     app: FastAPI
     port: int
     client: httpx.Client
+    loop: asyncio.AbstractEventLoop
 
     def post_json(self, request: Any, **options: Any) -> httpx.Response:
         """NaN and Infinity are written as Python's json does."""
@@ -126,7 +128,7 @@ def live_server(
         ready: wait until the detector is there.
         settings: of the service.
     """
-    app = create_app(ServiceSettings(**{"max_concurrent": 2} | settings), load_detector=load_detector)
+    app = create_app(ServiceSettings(**{"max_concurrent": 2, "warm_up": ()} | settings), load_detector=load_detector)
     config = uvicorn.Config(app, port=0, http="h11", ws="none", lifespan="on", log_config=None, access_log=False)
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run)
@@ -137,7 +139,7 @@ def live_server(
         with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30, trust_env=False) as client:
             if ready:
                 wait_until(lambda: client.get("/readyz").status_code == 200)
-            yield LiveServer(app=app, port=port, client=client)
+            yield LiveServer(app=app, port=port, client=client, loop=server.servers[0].get_loop())
     finally:
         server.should_exit = True
         thread.join(timeout=20)

@@ -82,7 +82,10 @@ def serving_process(
         settings: of the service.
     """
     code = SERVE_BY_RULE.format(
-        tests=str(Path(__file__).parent), delay_s=delay_s, before_load=before_load, settings=settings
+        tests=str(Path(__file__).parent),
+        delay_s=delay_s,
+        before_load=before_load,
+        settings={"warm_up": ""} | settings,
     )
     process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, env=os.environ)
     serving = ServingProcess(process)

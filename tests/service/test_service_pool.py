@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import threading
 from collections.abc import Callable
 
@@ -128,6 +129,26 @@ def test_errors_reach_who_waits_and_the_worker_lives_on() -> None:
         assert await hall.pool.run(hall.work(7), within_s=WAIT_S) == 7
 
     in_hall(scene)
+
+
+def test_an_error_after_its_client_left_is_nobodys(caplog: pytest.LogCaptureFixture) -> None:
+    async def scene(hall: Hall) -> None:
+        def failing(job: Job[int]) -> int:
+            hall.begun.append(0)
+            hall.may_go.wait(WAIT_S)
+            raise ValueError("too late")
+
+        task = asyncio.create_task(hall.pool.run(failing, within_s=WAIT_S))
+        await reached(lambda: hall.begun == [0])
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        hall.may_go.set()
+        assert await hall.pool.run(hall.work(1), within_s=WAIT_S) == 1
+        gc.collect()
+
+    in_hall(scene)
+    assert caplog.messages == []
 
 
 def test_a_loop_that_has_ended_does_not_end_the_worker() -> None:

@@ -77,6 +77,10 @@ def test_run_ends_with_the_error_of_a_model_that_cannot_be_loaded(
 def test_bind_both_families_and_refuses_what_is_not_ours() -> None:
     with service_server.bind("127.0.0.1", 0) as listener:
         assert listener.family == socket.AF_INET
+        with socket.create_connection(listener.getsockname(), timeout=5):
+            accepted, _ = listener.accept()
+            with accepted:
+                assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
         with pytest.raises(ConfigError) as caught:
             service_server.bind(*listener.getsockname())
         assert (caught.value.code, caught.value.field) == ("address_unavailable", "port")

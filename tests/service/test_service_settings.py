@@ -15,7 +15,7 @@ def test_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = load_settings()
     assert (settings.host, settings.port, settings.threads, settings.checkpoint) == ("127.0.0.1", 8000, 1, None)
     assert settings.workers_at_once >= 1
-    assert settings.warm_up_sizes == ((752, 480),)
+    assert [str(camera) for camera in settings.warm_up] == ["752x480", "752x480@458"]
     assert (settings.image_limits.max_bytes, settings.image_limits.max_pixels) == (2**24, 2**24)
 
 
@@ -41,8 +41,10 @@ def test_argument_over_environment_over_default(monkeypatch: pytest.MonkeyPatch)
         ("VIFLOW_QUEUE_TIMEOUT_S", "inf", "queue_timeout_s"),
         ("VIFLOW_LOG_LEVEL", "loud", "log_level"),
         ("VIFLOW_WORKERS", "0", "workers"),
-        ("VIFLOW_WARM_UP_SIZES", "752", "warm_up_sizes"),
-        ("VIFLOW_WARM_UP_SIZES", "752x480,0x1", "warm_up_sizes"),
+        ("VIFLOW_WARM_UP", "752", "warm_up"),
+        ("VIFLOW_WARM_UP", "752x480,0x1", "warm_up"),
+        ("VIFLOW_WARM_UP", "752x480@0", "warm_up"),
+        ("VIFLOW_WARM_UP", "752x480@", "warm_up"),
         ("VIFLOW_DETECTOR__REGIONS__THRESHOLD", "1", "detector.regions.threshold"),
     ],
 )
@@ -106,19 +108,19 @@ def test_cores_are_shared_out_among_the_processes(monkeypatch: pytest.MonkeyPatc
     assert ServiceSettings(workers=2, max_concurrent=5).workers_at_once == 5
 
 
-def test_sizes_to_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("VIFLOW_WARM_UP_SIZES", "640x480, 1242x375")
-    assert load_settings().warm_up_sizes == ((640, 480), (1242, 375))
-    monkeypatch.setenv("VIFLOW_WARM_UP_SIZES", "")
-    assert load_settings().warm_up_sizes == ()
+def test_cameras_to_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VIFLOW_WARM_UP", "640x480, 1242x375@721.5")
+    assert load_settings().warm_up == ((640, 480, None), (1242, 375, 721.5))
+    monkeypatch.setenv("VIFLOW_WARM_UP", "")
+    assert load_settings().warm_up == ()
 
 
 def test_argument_over_environment_over_file(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VIFLOW_MAX_QUEUED", "7")
-    file_values = {"max_queued": 5, "queue_timeout_s": 2.5, "port": 9001, "warm_up_sizes": "64x64"}
+    file_values = {"max_queued": 5, "queue_timeout_s": 2.5, "port": 9001, "warm_up": "64x64"}
     settings = load_settings(file_values, port=9002)
     assert (settings.max_queued, settings.queue_timeout_s, settings.port) == (7, 2.5, 9002)
-    assert settings.warm_up_sizes == ((64, 64),)
+    assert settings.warm_up == ((64, 64, None),)
 
 
 @pytest.mark.parametrize("name", ["max_queue", "detector", "checkpoint"])

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -157,3 +158,25 @@ def test_the_address_of_another_service_is_refused_also_for_several_processes() 
         )
         assert ended.returncode == 2
         assert f"127.0.0.1:{serving.port}" in ended.stderr
+
+
+def test_who_is_inside_when_the_time_is_up_is_refused_and_the_worker_told() -> None:
+    may_go = threading.Event()
+    detector = RuleDetector(may_go=may_go)
+    with (
+        live_server(lambda settings: detector, max_concurrent=1, max_queued=1) as server,
+        ThreadPoolExecutor(max_workers=2) as clients,
+    ):
+        try:
+            running = [clients.submit(server.post_json, json_request()) for _ in range(2)]
+            wait_until(lambda: server.app.state.core.gate.present == 2)
+            wait_until(lambda: len(detector.calls) == 1)
+            gate = server.app.state.core.gate
+            server.loop.call_soon_threadsafe(gate.expel)
+            for answer in running:
+                assert_problem(answer.result(), 503, "shutting_down", None)
+            assert gate.present == 0
+        finally:
+            may_go.set()
+        assert server.post_json(json_request()).status_code == 200
+        assert len(detector.calls) == 2
