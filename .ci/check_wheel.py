@@ -11,6 +11,7 @@ REQUIRED = (
     "viflow_anomaly/schemas/detection-1.0.schema.json",
     "viflow_anomaly/cli/main.py",
     "viflow_anomaly_service/server.py",
+    "viflow_anomaly_service/store/migrations/versions/v0001_detections.py",
 )
 MAX_WEIGHTS_BYTES = 8 * 1024 * 1024
 

@@ -26,6 +26,10 @@ from viflow_anomaly_service.security_headers import SecurityHeadersMiddleware
 from viflow_anomaly_service.service_core import ServiceCore
 from viflow_anomaly_service.settings import ServiceSettings, load_settings
 from viflow_anomaly_service.state_endpoints import VERSION, add_state
+from viflow_anomaly_service.store.attach import configured_keeper
+from viflow_anomaly_service.store.endpoints import add_detections
+from viflow_anomaly_service.streams.endpoints import add_streams
+from viflow_anomaly_service.streams.table import StreamTable
 
 MEMORY_SECONDS: Final = 5.0
 
@@ -44,19 +48,25 @@ def create_app(
         on_load_failure: told when that raised; ``/readyz`` then stays at 503.
 
     Raises:
-        ConfigError: ``config_invalid``, an environment variable that cannot be used.
+        ConfigError: ``config_invalid``, an environment variable that cannot be used; ``store_url_invalid``.
+        MissingDependencyError: ``store_missing``.
     """
     core = _build(settings or load_settings(), load_detector, on_load_failure)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         core.pool.start()
-        tasks = [asyncio.create_task(core.slot.fill()), asyncio.create_task(_watch_memory(core.metrics))]
+        background = (core.slot.fill(), _watch_memory(core.metrics), core.streams.watch())
+        tasks = [asyncio.create_task(one) for one in background]
+        if core.keeper is not None:
+            core.keeper.start()
         yield
         core.gate.close()
         for task in tasks:
             task.cancel()
         await asyncio.to_thread(core.pool.close)
+        if core.keeper is not None:
+            await core.keeper.close()
 
     app = FastAPI(
         title="viflow-anomaly",
@@ -75,6 +85,8 @@ def create_app(
     add_models(app, core)
     add_detect(app, core)
     complete_openapi(app)
+    add_detections(app, core)
+    add_streams(app, core)
     return app
 
 
@@ -84,6 +96,7 @@ def _build(
     """The one place where the settings' numbers meet the parts."""
     metrics = ServiceMetrics()
     workers = settings.workers_at_once
+    gate = AdmissionGate(places=workers + settings.max_queued, metrics=metrics)
     pool = DetectorPool(workers=workers, metrics=metrics)
 
     async def warm_up_everywhere(detector: PairDetector) -> None:
@@ -96,8 +109,10 @@ def _build(
         slot=DetectorSlot(
             lambda: load_detector(settings), prepare=warm_up_everywhere, metrics=metrics, on_failure=on_load_failure
         ),
-        gate=AdmissionGate(places=workers + settings.max_queued, metrics=metrics),
+        gate=gate,
         pool=pool,
+        keeper=configured_keeper(settings, metrics),
+        streams=StreamTable(settings, gate, metrics),
     )
 
 

@@ -15,6 +15,7 @@ from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.request_body import RequestBody
 from viflow_anomaly_service.request_log import log_fields
 from viflow_anomaly_service.service_core import ServiceCore
+from viflow_anomaly_service.store.openapi import DETECTION_ID_HEADER
 
 JSON_MEDIA_TYPE: Final = "application/json"
 FORM_MEDIA_TYPE: Final = "multipart/form-data"
@@ -28,17 +29,17 @@ def add_detect(app: FastAPI, core: ServiceCore) -> None:
         """Regions of independent motion in the source image of one pair, highest score first."""
         body = RequestBody(request)
         try:
-            answer = await _answer(core, request, body)
+            answer, headers = await _answer(core, request, body)
         except Problem as problem:
             if problem.status != HTTPStatus.REQUEST_TIMEOUT:
                 await body.discard()
             problem.closes_connection = not body.finished
             raise
-        return Response(answer, media_type=JSON_MEDIA_TYPE)
+        return Response(answer, media_type=JSON_MEDIA_TYPE, headers=headers)
 
 
-async def _answer(core: ServiceCore, request: Request, body: RequestBody) -> bytes:
-    """The answer's bytes.
+async def _answer(core: ServiceCore, request: Request, body: RequestBody) -> tuple[bytes, dict[str, str]]:
+    """The answer's bytes, and its headers beyond the usual ones.
 
     Raises:
         Problem: the request is refused, or something is wrong with it.
@@ -51,6 +52,8 @@ async def _answer(core: ServiceCore, request: Request, body: RequestBody) -> byt
     except Problem:
         core.metrics.shed.labels("not_ready").inc()
         raise
+    if core.keeper is not None:
+        core.keeper.require_usable()  # before a pair is judged for nothing
     content_type = accepted_content_type(request)
     async with core.gate.admitted():
         started = time.perf_counter()
@@ -60,11 +63,22 @@ async def _answer(core: ServiceCore, request: Request, body: RequestBody) -> byt
         work = DetectionWork(detector, data, content_type, settings=settings, metrics=core.metrics)
         del data  # the work alone holds it, and lets go of it once it is decoded
         try:
-            return await body.while_connected(core.pool.run(work, within_s=settings.queue_timeout_s))
+            return await body.while_connected(_judged_and_kept(core, work))
         except DeadlinePassedError as err:
             raise core.gate.shed("deadline", f"no turn came within {settings.queue_timeout_s:g} s") from err
         finally:
             log_fields(request.scope).update(work.log, upload_ms=round(uploaded_s * 1e3, 3))
+
+
+async def _judged_and_kept(core: ServiceCore, work: DetectionWork) -> tuple[bytes, dict[str, str]]:
+    """With a store there is no answer before its commit."""
+    answer = await core.pool.run(work, within_s=core.settings.queue_timeout_s)
+    if core.keeper is None or work.detection is None:
+        return answer, {}
+    started = time.perf_counter()
+    (kept_as,) = await core.keeper.keep([(work.detection, answer.decode())])
+    core.metrics.observe_stage("store", time.perf_counter() - started)
+    return answer, {DETECTION_ID_HEADER: kept_as}
 
 
 def accepted_content_type(request: Request) -> str:

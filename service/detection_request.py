@@ -98,10 +98,10 @@ def read_json(body: bytes, settings: ServiceSettings) -> ReceivedPair:
     Raises:
         Problem: 400, 413 or 422 as :func:`parse_json`; 422 for wrong fields and for ``image_base64_invalid``.
     """
-    request = _validated(DetectRequest, parse_json(body, max_values=settings.max_json_values))
+    request = validated(DetectRequest, parse_json(body, max_values=settings.max_json_values))
     parts = {"source": request.source, "target": request.target}
     return ReceivedPair(
-        images={name: _from_base64(part.image_base64, f"{name}.image_base64") for name, part in parts.items()},
+        images={name: from_base64(part.image_base64, f"{name}.image_base64") for name, part in parts.items()},
         timestamps_ns={name: part.timestamp_ns for name, part in parts.items()},
         imu=request.imu,
         rest=request,
@@ -127,7 +127,7 @@ def read_form(body: bytes, content_type: str, settings: ServiceSettings) -> Rece
             raise Problem(422, code="field_missing", detail=detail, field=name)
 
     def from_json(shape: type[Wire], name: str, data: bytes) -> Wire:
-        return _validated(shape, parse_json(data, max_values=settings.max_json_values, part=name), name)
+        return validated(shape, parse_json(data, max_values=settings.max_json_values, part=name), name)
 
     imu = from_json(StampedImuPart, "imu", parts["imu"])
     return ReceivedPair(
@@ -161,7 +161,7 @@ def frame_pair(received: ReceivedPair, settings: ServiceSettings) -> FramePair:
         InvalidInputError: with the library's field names.
     """
     rest = received.rest
-    imu = _imu_samples(received.imu, settings.max_imu_samples)
+    imu = imu_samples(received.imu, settings.max_imu_samples)
     camera = None if rest.camera is None else camera_from_mapping(rest.camera, field="camera")
     return FramePair(
         source=_frame("source", received, settings),
@@ -181,7 +181,12 @@ def _frame(name: str, received: ReceivedPair, settings: ServiceSettings) -> Fram
         raise type(err)(f"{name}: {err.message}", code=err.code, field=f"{name}.{err.field}") from err
 
 
-def _imu_samples(imu: ImuPart, max_samples: int) -> ImuSamples:
+def imu_samples(imu: ImuPart, max_samples: int) -> ImuSamples:
+    """The library's value.
+
+    Raises:
+        InvalidInputError: with the library's field names; ``TooLargeError`` for too many.
+    """
     if len(imu.timestamps_ns) > max_samples:
         raise TooLargeError(
             f"imu: expected at most {max_samples} samples, found {len(imu.timestamps_ns)}",
@@ -195,14 +200,24 @@ def _imu_samples(imu: ImuPart, max_samples: int) -> ImuSamples:
     )
 
 
-def _validated(shape: type[Wire], value: Any, prefix: str | None = None) -> Wire:
+def validated(shape: type[Wire], value: Any, prefix: str | None = None) -> Wire:
+    """What JSON says, in a wire shape.
+
+    Raises:
+        Problem: 422 with the fields at fault, below ``prefix``.
+    """
     try:
         return shape.model_validate(value)
     except ValidationError as err:
         raise problem_of_validation(err, prefix) from err
 
 
-def _from_base64(text: str, field: str) -> bytes:
+def from_base64(text: str, field: str) -> bytes:
+    """The bytes of an image.
+
+    Raises:
+        Problem: 422 ``image_base64_invalid``.
+    """
     slices = (text[start : start + BASE64_SLICE] for start in range(0, len(text), BASE64_SLICE))
     try:
         if "=" in text[:-2]:  # padding within: the whole says best what is wrong with it

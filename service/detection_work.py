@@ -29,6 +29,7 @@ class DetectionWork:
 
     Attributes:
         log: what the request's log line says of it: milliseconds by stage, status and number of regions.
+        detection: what the answer says; None before there is one.
     """
 
     def __init__(
@@ -46,6 +47,7 @@ class DetectionWork:
         self._settings = settings
         self._metrics = metrics
         self.log: dict[str, Any] = {}
+        self.detection: Detection | None = None
 
     def __call__(self, job: Job[bytes]) -> bytes:
         """The detection as UTF-8 JSON.
@@ -64,6 +66,7 @@ class DetectionWork:
                 detection = self._detector.with_config(config).detect(pair, decode_ms=self.log["decode_ms"])
             except ViflowError as err:
                 raise problem_of_error(err, field_names) from err
+        self.detection = detection
         self._metrics.observe_detection(detection)
         self._describe(detection)
         job.require_wanted()

@@ -19,7 +19,7 @@ from viflow_anomaly.detection import SCHEMA_VERSION, Detection, ModelInfo
 
 MULTIPROCESS_VARIABLE: Final = "PROMETHEUS_MULTIPROC_DIR"
 ShedReason = Literal["queue_full", "deadline", "shutting_down", "not_ready"]
-Stage = Literal["upload", "queue", "decode", "detect", "encode"]
+Stage = Literal["upload", "queue", "decode", "detect", "encode", "store"]
 SECONDS: Final = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 _METHODS: Final = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 _OTHER_IMU_FAULTS: Final = frozenset({"interval_too_long", "mounting_unknown", "no_accelerometer"})
@@ -65,11 +65,11 @@ class ServiceMetrics:
             registry=registry,
         )
         # Of live processes only: what a process that ended had in hand is gone with it.
-        self.queue_depth = self._gauge("viflow_queue_depth", "Requests that wait for a worker thread")
-        self.in_flight = self._gauge("viflow_requests_in_flight", "Requests inside: uploading, waiting, being judged")
-        self.workers_busy = self._gauge("viflow_workers_busy", "Worker threads that judge a pair")
-        self.workers = self._gauge("viflow_workers", "Worker threads")
-        self.ready = self._gauge("viflow_ready_processes", "Processes whose model is loaded")
+        self.queue_depth = self.gauge("viflow_queue_depth", "Requests that wait for a worker thread")
+        self.in_flight = self.gauge("viflow_requests_in_flight", "Requests inside: uploading, waiting, being judged")
+        self.workers_busy = self.gauge("viflow_workers_busy", "Worker threads that judge a pair")
+        self.workers = self.gauge("viflow_workers", "Worker threads")
+        self.ready = self.gauge("viflow_ready_processes", "Processes whose model is loaded")
         self._resident = Gauge(
             "viflow_resident_memory_bytes",
             "Memory of a process, pages it shares with others included",
@@ -84,7 +84,12 @@ class ServiceMetrics:
             multiprocess_mode="livemax",
         )
 
-    def _gauge(self, name: str, help_text: str) -> Gauge:
+    @property
+    def registry(self) -> CollectorRegistry:
+        """For the instruments of a part that not every service has."""
+        return self._registry
+
+    def gauge(self, name: str, help_text: str) -> Gauge:
         return Gauge(name, help_text, registry=self._registry, multiprocess_mode="livesum")
 
     def observe_stage(self, stage: Stage, seconds: float) -> None:

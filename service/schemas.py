@@ -17,7 +17,7 @@ from viflow_anomaly.sensor_data import DISTORTION_COEFF_COUNTS
 INT64_MAX = int(np.iinfo(np.int64).max)
 
 _NUMBER = {"type": "number"}
-_CAMERA_SCHEMA = {
+CAMERA_SCHEMA = {
     "type": "object",
     "description": "Calibration of the images as they are sent. T_cam_imu maps IMU to camera coordinates (Kalibr), "
     "t_imu = t_cam + time_offset_s.",
@@ -107,7 +107,7 @@ class OptionsPart(WireModel):
 class RequestRest(WireModel):
     """The optional ``request`` part of a multipart request."""
 
-    camera: Annotated[dict[str, Any], WithJsonSchema(_CAMERA_SCHEMA)] | None = None
+    camera: Annotated[dict[str, Any], WithJsonSchema(CAMERA_SCHEMA)] | None = None
     motor_command: list[float] | None = None
     options: OptionsPart | None = None
 

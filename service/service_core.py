@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from viflow_anomaly_service.admission import AdmissionGate
 from viflow_anomaly_service.detector_pool import DetectorPool
 from viflow_anomaly_service.detector_slot import DetectorSlot
 from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.settings import ServiceSettings
+from viflow_anomaly_service.streams.table import StreamTable
+
+if TYPE_CHECKING:
+    from viflow_anomaly_service.store.keeper import ResultKeeper
 
 
 @dataclass(frozen=True)
@@ -21,6 +26,8 @@ class ServiceCore:
         slot: the detector, once it is loaded.
         gate: who may come in.
         pool: who does the work.
+        keeper: where detections stay; None: nowhere.
+        streams: what is remembered between frames.
     """
 
     settings: ServiceSettings
@@ -28,3 +35,5 @@ class ServiceCore:
     slot: DetectorSlot
     gate: AdmissionGate
     pool: DetectorPool
+    keeper: ResultKeeper | None
+    streams: StreamTable

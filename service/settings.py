@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
-from pydantic import BeforeValidator, Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
+from pydantic import BeforeValidator, Field, NonNegativeInt, PositiveFloat, PositiveInt, SecretStr, ValidationError
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict, SettingsError
 
 from viflow_anomaly.config import (
@@ -123,6 +123,14 @@ class ServiceSettings(BaseSettings):
     allowed_origins: Origins = Field(default=(), description="sites whose pages may ask (CORS)")
     shutdown_timeout_s: PositiveInt = Field(default=20, description="time for running requests after SIGTERM")
     warm_up: Cameras = Field(default=_EUROC, description="WIDTHxHEIGHT[@FOCAL] of what is judged before it is ready")
+    store_url: SecretStr | None = Field(
+        default=None, description="where detections stay: a path or sqlite:////path, or postgresql://...; none: nowhere"
+    )
+    store_max_age_s: PositiveFloat | None = Field(default=None, description="older detections are deleted")
+    store_max_bytes: PositiveInt = Field(default=8 * 1024 * MEBIBYTE, description="of detections that stay")
+    max_streams: PositiveInt = Field(default=64, description="streams at once")
+    max_stream_bytes: PositiveInt = Field(default=256 * MEBIBYTE, description="what all streams remember together")
+    stream_idle_s: PositiveFloat = Field(default=60.0, description="after which a stream is forgotten")
     log_level: Literal["debug", "info", "warning", "error"] = "info"
 
     @property

@@ -35,6 +35,8 @@ def add_state(app: FastAPI, core: ServiceCore) -> None:
         """The model is loaded and warm, and ``/detect`` will answer."""
         core.gate.require_open()
         core.slot.require()
+        if core.keeper is not None:
+            core.keeper.require_usable()
         return JSONResponse({"status": "ready"})
 
     @app.get("/version", operation_id="version", tags=["state"], responses=VERSION_RESPONSES)

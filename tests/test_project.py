@@ -126,17 +126,17 @@ def test_documented_make_targets_exist() -> None:
 
 
 def test_every_package_is_listed_for_the_wheel() -> None:
-    packages = {
-        ".".join(init.parent.relative_to(ROOT).parts) for init in (ROOT / "viflow_anomaly").rglob("__init__.py")
-    }
+    tops = [ROOT / "viflow_anomaly", ROOT / "service"]
+    packages = {".".join(init.parent.relative_to(ROOT).parts) for top in tops for init in top.rglob("__init__.py")}
     folders = {
         ".".join(path.relative_to(ROOT).parts)
-        for path in [ROOT / "viflow_anomaly", *(ROOT / "viflow_anomaly").rglob("*")]
+        for top in tops
+        for path in [top, *top.rglob("*")]
         if path.is_dir() and path.name != "__pycache__"
     }
     listed = set(PYPROJECT["tool"]["setuptools"]["packages"])
     assert packages == folders
-    assert listed == packages | {"viflow_anomaly_service"}
+    assert listed == {re.sub(r"^service\b", "viflow_anomaly_service", name) for name in packages}
 
 
 def test_the_wheel_check_finds_what_is_missing(tmp_path: Path) -> None:

@@ -60,6 +60,12 @@ SERVICE_SETTINGS = (
     "allowed_origins",
     "shutdown_timeout_s",
     "warm_up",
+    "store_url",
+    "store_max_age_s",
+    "store_max_bytes",
+    "max_streams",
+    "max_stream_bytes",
+    "stream_idle_s",
     "log_level",
 )
 """What the service alone takes and checks. It is built on the library, which cannot ask it; a test compares the two."""

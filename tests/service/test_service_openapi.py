@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import jsonschema
 import pytest
-from service_world import LiveServer
+from rule_detector import RuleDetector
+from service_world import LiveServer, json_request, live_server
 
-from viflow_anomaly_service.examples import EXAMPLE_FAULTS, example_form_request, example_image_png
+from viflow_anomaly_service.examples import (
+    EXAMPLE_FAULTS,
+    INTERVAL_NS,
+    SOURCE_NS,
+    example_form_request,
+    example_image_png,
+)
+from viflow_anomaly_service.store.query import FILTER_NAMES
 
 HTTP_METHODS = {"get", "post", "put", "delete", "patch", "head", "options", "trace"}
 
@@ -61,6 +70,13 @@ def test_operation_ids_are_stable(document: dict[str, Any]) -> None:
         ("/models", "get"): "models",
         ("/schemas/detection-1.0.json", "get"): "detectionSchema",
         ("/detect", "post"): "detect",
+        ("/detections", "get"): "listDetections",
+        ("/detections.ndjson", "get"): "exportDetections",
+        ("/detections/{detection_id}", "get"): "getDetection",
+        ("/streams", "get"): "listStreams",
+        ("/streams/{stream_id}", "get"): "getStream",
+        ("/streams/{stream_id}", "delete"): "deleteStream",
+        ("/streams/{stream_id}/frames", "post"): "addFrame",
     }
 
 
@@ -144,6 +160,43 @@ def test_problem_answers_fit_the_documented_schema(server: LiveServer, document:
         server.post_form({"x": ("x", b"1")}),
     ):
         check.validate(response.json())
+
+
+def test_stored_detections_fit_the_documented_schema(document: dict[str, Any], tmp_path: Path) -> None:
+    with live_server(lambda settings: RuleDetector(), store_url=str(tmp_path / "x.db")) as storing:
+        kept = storing.post_json(json_request()).headers["x-detection-id"]
+        answers = {
+            "DetectionPage": storing.client.get("/detections", params={"limit": 1}).json(),
+            "StoredDetection": storing.client.get(f"/detections/{kept}").json(),
+        }
+    for name, answer in answers.items():
+        validator(document, {"$ref": f"#/components/schemas/{name}"}).validate(answer)
+
+
+def test_the_stream_example_works_and_answers_as_documented(server: LiveServer, document: dict[str, Any]) -> None:
+    body = document["paths"]["/streams/{stream_id}/frames"]["post"]["requestBody"]["content"]
+    example = body["application/json"]["example"]
+    answers = {"StreamAnswer": server.client.post("/streams/drone7/frames", json=example)}
+    again = example | {"frame": example["frame"] | {"timestamp_ns": SOURCE_NS + INTERVAL_NS}}
+    answers |= {"StreamAnswer ": server.client.post("/streams/drone7/frames", json=again)}
+    answers |= {"StreamStatus": server.client.get("/streams/drone7"), "StreamList": server.client.get("/streams")}
+    for name, answer in answers.items():
+        assert answer.status_code == 200, answer.text
+        validator(document, {"$ref": f"#/components/schemas/{name.strip()}"}).validate(answer.json())
+    assert len(answers["StreamAnswer "].json()["detections"]) == 1
+    form = body["multipart/form-data"]["example"]
+    files = {
+        "frame": ("frame.png", example_image_png(), "image/png"),
+        **{name: (None, json.dumps(form[name]), "application/json") for name in ("imu", "request")},
+    }
+    assert server.client.post("/streams/drone8/frames", files=files).status_code == 200
+    assert server.client.delete("/streams/drone8").status_code == 204
+
+
+def test_the_parameters_of_a_list_are_documented(document: dict[str, Any]) -> None:
+    for path, refused in (("/detections", ()), ("/detections.ndjson", ("limit", "cursor"))):
+        documented = {one["name"] for one in document["paths"][path]["get"]["parameters"]}
+        assert documented == {*FILTER_NAMES, "limit", "cursor"} - {*refused}
 
 
 def test_docs_page_is_served(server: LiveServer) -> None:

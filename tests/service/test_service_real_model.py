@@ -23,8 +23,10 @@ from service_world import INTERVAL_NS, T0, LiveServer, assert_problem, base64_te
 
 from viflow_anomaly.alarm_calibration import make_calibration, write_calibration
 from viflow_anomaly.alarm_footage import JudgedPair, WatchedRecording, footage_of
+from viflow_anomaly.batch_job import BatchOptions, run_batch
 from viflow_anomaly.config import DetectorConfig
 from viflow_anomaly.datasets.camera_json import camera_from_mapping
+from viflow_anomaly.datasets.registry import open_recording
 from viflow_anomaly.detection import load_detection_schema, to_json_dict
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import ConfigError
@@ -283,3 +285,31 @@ def test_models_fit_their_schema(server: LiveServer) -> None:
     )
     with without_head as other:
         assert [model["role"] for model in other.client.get("/models").json()["models"]] == ["network"]
+
+
+def test_a_stream_says_what_a_batch_of_the_recording_says(server: LiveServer, tmp_path: Path) -> None:
+    recording = open_recording(ROOT / "samples" / "drone")
+    run_batch(recording, load_bundled_or_configured(load_settings()), BatchOptions(out_dir=tmp_path, overwrite=True))
+    lines = [json.loads(line) for line in (tmp_path / "detections.jsonl").read_text(encoding="utf-8").splitlines()]
+    request = json.loads((ROOT / "samples" / "drone" / "request.json").read_text(encoding="utf-8"))
+    log = recording.imu
+    assert log.accel_m_s2 is not None
+    found: list[dict[str, Any]] = []
+    sent = 0
+    for k, stamp_ns in enumerate(recording.frame_timestamps_ns.tolist()):
+        until = int(np.searchsorted(log.timestamps_ns, stamp_ns)) + 1
+        samples = {
+            "timestamps_ns": log.timestamps_ns[sent:until].tolist(),
+            "gyro_rad_s": log.gyro_rad_s[sent:until].tolist(),
+            "accel_m_s2": log.accel_m_s2[sent:until].tolist(),
+        }
+        sent = until
+        frame = {"timestamp_ns": stamp_ns, "image_base64": base64_text(png(recording.frame(k).image))}
+        body = {"frame": frame, "imu": samples} | ({"camera": request["camera"]} if k == 0 else {})
+        answer = server.client.post("/streams/drone/frames", json=body)
+        assert answer.status_code == 200, answer.text
+        assert answer.json()["faults"] == []
+        found += answer.json()["detections"]
+    untimed = [{name: value for name, value in one.items() if name != "timings_ms"} for one in found]
+    assert untimed == [{name: value for name, value in one.items() if name != "timings_ms"} for one in lines]
+    assert any(roi["track_id"] is not None for one in found for roi in one["rois"])
