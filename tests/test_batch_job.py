@@ -14,7 +14,7 @@ import pytest
 from difference_detector import DifferenceDetector
 from worlds import World, in_memory, make_world, with_stamps, write_png
 
-from viflow_anomaly import batch_files, batch_record
+from viflow_anomaly import batch_files, batch_job, batch_record
 from viflow_anomaly.batch_files import Journal
 from viflow_anomaly.batch_job import BatchOptions, run_batch
 from viflow_anomaly.batch_pictures import spread_indices
@@ -558,3 +558,22 @@ def test_another_evidence_head_is_another_run(tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match=r"model\.version") as caught:
         check_same_run(earlier, {"model": {"sha256": "a", "version": "1+head.c"}}, out_dir=tmp_path)
     assert caught.value.code == "resume_config_differs"
+
+
+def test_the_place_stays_taken_until_the_run_says_done(
+    recording: FileRecording, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refused: list[str] = []
+    write = batch_job.write_json
+
+    def seen(path: Path, values: dict[str, Any]) -> None:
+        write(path, values)
+        if values["state"] == "done":
+            with pytest.raises(InvalidInputError) as caught:
+                Journal(out / "detections.jsonl.partial")
+            refused.append(caught.value.code)
+
+    monkeypatch.setattr(batch_job, "write_json", seen)
+    run_batch(recording, DifferenceDetector(), BatchOptions(out_dir=out))
+    assert refused == ["output_in_use"]
+    assert not (out / "detections.jsonl.partial").exists()

@@ -107,6 +107,13 @@ def test_a_band_is_model_error_and_scores_below_a_half() -> None:
     assert region.score == BAND_SCORE
 
 
+def test_what_is_most_of_the_picture_is_model_error() -> None:
+    (region,) = regions_of(maps((slice(4, 92), slice(4, 120)), probability=0.99))
+    assert (region.label, region.score, region.evidence["rule"]) == ("model_error", BAND_SCORE, "most_of_the_picture")
+    (region,) = regions_of(maps((slice(4, 92), slice(4, 70)), probability=0.99))
+    assert region.label == "independent_motion"
+
+
 def test_a_higher_motion_score_changes_the_label_alone() -> None:
     (low,), (high,) = (regions_of(maps(BOX), RegionConfig(motion_score=motion_score)) for motion_score in (0.5, 0.95))
     assert (low.label, high.label) == ("independent_motion", "model_error")

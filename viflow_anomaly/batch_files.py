@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 from viflow_anomaly.detection_reading import detection_from_json
 from viflow_anomaly.errors import InvalidInputError
@@ -63,15 +63,13 @@ class Journal:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._file = path.open("a+b")
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as err:
+        if not _is_alone(self._file, path):
             self._file.close()
             raise InvalidInputError(
                 f"{path.parent}: expected to be the only run that writes there, found another one at work",
                 code="output_in_use",
                 field="out",
-            ) from err
+            )
         self.lines: dict[Stamps, JournalLine] = {}
         self._end = self._recover()
         self._synced_at = time.monotonic()
@@ -123,7 +121,7 @@ class Journal:
         return self._file.read(line.length)
 
     def publish(self, destination: Path, finish: Callable[[Iterator[bytes]], Iterable[bytes]] = iter) -> None:
-        """Write all lines to ``destination`` (whole or not at all), and remove the journal.
+        """Write all lines to ``destination`` (whole or not at all).
 
         Args:
             destination: of the lines.
@@ -135,7 +133,19 @@ class Journal:
             sorted_file.flush()
             os.fsync(sorted_file.fileno())
         temporary.replace(destination)
+
+    def remove(self) -> None:
+        """Remove the journal, as the last act of a run: until then nobody else may begin one there."""
         self._path.unlink()
+
+
+def _is_alone(file: BinaryIO, path: Path) -> bool:
+    """Lock the file; False where another run has, or has just removed it since it was opened."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except (BlockingIOError, FileNotFoundError):
+        return False
 
 
 def _parse_line(raw: bytes) -> tuple[Stamps, str] | None:

@@ -138,6 +138,7 @@ def run_batch(
         rig = job.state.rig.report(options.rig_estimate) if len(job.rig) else None
         outcome = {**describe_outcome(summary), "rig_estimate": rig}
         write_json(options.out_dir / RUN_NAME, {"state": "done", **run, **outcome})
+        journal.remove()
     return summary
 
 

@@ -23,10 +23,11 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from multiprocessing.connection import wait
+from statistics import median
 from typing import TypeVar
 
 from viflow_anomaly.allocator import keep_freed_memory
-from viflow_anomaly.batch_pairs import PairAnalyzer, PairAnswer, PairJudge, PairTask
+from viflow_anomaly.batch_pairs import JudgedPair, PairAnalyzer, PairAnswer, PairJudge, PairTask
 from viflow_anomaly.config import RigEstimateConfig
 from viflow_anomaly.datasets.pairing import RecordingPairs
 from viflow_anomaly.errors import ViflowError
@@ -37,6 +38,8 @@ QUEUED_PER_HELPER = 3
 """One that is judged, and enough behind it that no helper waits while this process is busy with a pair of its own."""
 PAIRS_BEFORE = 6
 """Judged alone to see how long a pair takes; the first ones load and compile what later ones find ready."""
+UNKNOWN_PAIR_S = 0.05
+"""Where none of them could be judged."""
 WORTH_S = 4.0
 """Work that is left for each helper, alone, below which to start one (two seconds) is not worth it."""
 
@@ -74,16 +77,18 @@ def answers_in_order(
     if helpers is None or helpers.count < 1:
         yield from map(judge, remaining)
         return
-    fastest_s = float("inf")
+    judged_s = []
     for task in islice(remaining, PAIRS_BEFORE):
         started = time.perf_counter()
         answer = judge(task)
-        fastest_s = min(fastest_s, time.perf_counter() - started)
+        if isinstance(answer, JudgedPair) and answer.status == "ok":  # what cannot be judged takes hardly any time
+            judged_s.append(time.perf_counter() - started)
         yield answer
+    typical_s = median(judged_s) if judged_s else UNKNOWN_PAIR_S
     left = max(0, pairs - PAIRS_BEFORE)
     count = min(helpers.count, left)
     if left and helpers.worth_s > 0:
-        count = min(count, int(fastest_s * left / helpers.worth_s))
+        count = min(count, int(typical_s * left / helpers.worth_s))
     if count < 1:
         yield from map(judge, remaining)
         return

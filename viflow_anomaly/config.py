@@ -222,7 +222,10 @@ class RegionConfig(FrozenConfig):
         default=0.5, ge=0.01, le=0.99, description="of a pixel, with learned evidence"
     )
     faint_motion_probability: float = Field(
-        default=0.15, ge=0.01, le=0.99, description="of the pixels of a thing that nowhere reaches the other"
+        default=0.15,
+        ge=0.01,
+        le=0.99,
+        description="of a thing that nowhere reaches the other; above it: none",
     )
     opening_fraction: float = Field(default=0.004, ge=0, le=0.1)
     closing_fraction: float = Field(default=0.012, ge=0, le=0.1)

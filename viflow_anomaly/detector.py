@@ -148,7 +148,8 @@ class AnomalyDetector:
                 else torch.
             threads: CPU threads of the network (torch: of the whole process); None: torch's own, one elsewhere.
             evidence_head: a ``.safetensors`` file likewise; None: the bundled one.
-            with_evidence: False: none is loaded, and regions are found in the residual.
+            with_evidence: False: none is loaded, and regions are found in the residual; nor is one for a configuration
+                that takes the residual.
             precision: of the evidence head; "f32" answers alike in all runtimes.
             network_precision: likewise of the network.
 
@@ -159,13 +160,13 @@ class AnomalyDetector:
         loaded, record = load_runtime(
             path, runtime=runtime, device=device, threads=threads, precision=network_precision
         )
-        evidence = None
-        if with_evidence:
+        evidence, config = None, config or DetectorConfig()
+        if with_evidence and config.evidence != "residual":
             evidence = load_evidence(
                 evidence_head, runtime=runtime, device=device, threads=threads, precision=precision
             )
             require_our_cues(evidence.record)
-        return cls(loaded, record, config=config or DetectorConfig(), evidence=evidence)
+        return cls(loaded, record, config=config, evidence=evidence)
 
     @property
     def runtime(self) -> str:

@@ -33,6 +33,13 @@ def require_our_cues(record: EvidenceRecord) -> None:
     """
     expected = (PHOTOMETRIC_CUES, GEOMETRIC_CUES, CUES_VERSION)
     found = (record.photometric_cues, record.geometric_cues, record.cues_version)
+    if expected[:2] == found[:2] and record.cues_version != CUES_VERSION:
+        raise CheckpointError(
+            f"evidence head {record.name} {record.version}: expected one trained on cues_version {CUES_VERSION}, "
+            f"found {record.cues_version}; train it anew (train-evidence)",
+            code="evidence_cues_differ",
+            field="evidence_head",
+        )
     if expected != found:
         raise CheckpointError(
             f"evidence head {record.name} {record.version}: expected one that was trained on the cues (names, "

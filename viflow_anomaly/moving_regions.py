@@ -37,8 +37,12 @@ SEAM_REACH_PX = 5
 MAX_LOGIT = 8.0
 FEATURE_SAMPLES = 512
 """Means over a region are taken over so many of its pixels, evenly spread: more say nothing new, and cost time."""
+MAX_AREA_SHARE = 0.6
+"""Where more than this of what can be compared seems to move, it is the explanation that is wrong: of another scene,
+say, or by a wrong motion of the camera."""
+TOO_LARGE = "most_of_the_picture"
 BAND_SCORE = 0.49
-"""The most that a region scores which the shape rule calls a band."""
+"""The most that a region scores which the shape rule calls a band, or which is most of the picture."""
 REGION_FEATURES = (
     "logit of the mean probability",
     "logit of the largest probability",
@@ -74,7 +78,8 @@ class MotionMaps(NamedTuple):
 
 
 class MeasuredRegion(NamedTuple):
-    """A component before it has a score: ``features`` [13] are ``REGION_FEATURES``, ``outline`` is its box's mask."""
+    """A component before it has a score: ``features`` [13] are ``REGION_FEATURES``, ``outline`` is its box's mask,
+    ``area_share`` its part of what can be compared."""
 
     component: Component
     box: BoundingBox
@@ -82,6 +87,7 @@ class MeasuredRegion(NamedTuple):
     thickness_px: float
     shape: Shape
     features: Float64Array
+    area_share: float
 
 
 def measure_regions(
@@ -96,14 +102,15 @@ def measure_regions(
     y, x = pixels_of(mask[part])
     labels = _things(maps, mask[part], part, config)[mask[part]]
     components = largest_components(y + top, x + left, labels, mask.size, config)
-    limits = shape_limits(config, float(np.hypot(*mask.shape)))
+    limits, compared_px = shape_limits(config, float(np.hypot(*mask.shape))), np.count_nonzero(inside)
     measured = []
     for component in components:
         box, outline = component.outline()
         thickness = thickness_px(outline)
         shape = judge_shape(config.shape_rule, outline, thickness, limits)
         features = _features(component, box, maps, cues, outline, shape)
-        measured.append(MeasuredRegion(component, box, outline, thickness, shape, features))
+        share = component.y.size / int(compared_px)
+        measured.append(MeasuredRegion(component, box, outline, thickness, shape, features, share))
     return measured
 
 
@@ -134,13 +141,16 @@ def find_moving_regions(
 
 
 def _judge(measured: MeasuredRegion, residual: Float32Array, score: RegionScore, config: RegionConfig) -> Region:
-    _, box, outline, thickness, shape, features = measured
+    _, box, outline, thickness, shape, features, area_share = measured
     probability = probability_of(features, score)
-    if not shape.passes:
+    too_large = area_share > MAX_AREA_SHARE
+    if too_large or not shape.passes:
         probability = min(probability, BAND_SCORE)
-    moves = shape.passes and probability >= config.motion_score
+    moves = shape.passes and not too_large and probability >= config.motion_score
     values = residual[box.pixels][outline]
     evidence = _evidence(features, shape, box.width / box.height, config)
+    if too_large:
+        evidence["rule"] = TOO_LARGE
     return region_of(values, box, outline, moves=moves, score=probability, thickness_px=thickness, evidence=evidence)
 
 

@@ -136,6 +136,18 @@ def sha256(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
+def test_another_spelling_of_the_own_place_keeps_record_and_file_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = saved(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    export_network(Path(path.name), out=path.with_suffix(".onnx"), file_format="onnx")
+    load_runtime(path, runtime="onnxruntime")
+    with pytest.raises(ConfigError) as caught:
+        export_network(path, out=Path("net.int8.xml"), file_format="openvino")
+    assert caught.value.code == "export_name"
+
+
 def test_a_new_checkpoint_takes_all_old_exports_away(tmp_path: Path) -> None:
     path = saved(tmp_path)
     for suffix in (*EXPORT_SUFFIXES, ".bin", ".int8.bin"):

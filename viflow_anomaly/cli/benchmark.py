@@ -89,9 +89,9 @@ def benchmark(
     report |= {"load_1min_after": round(os.getloadavg()[0], 2), "repeats": plan.repeats, "rows": compared.rows}
     report |= {"paper_ratios": ratios, "curves": measured, "skipped": compared.skipped}
     tables = [comparison_table(compared.rows), *([paper_table(ratios)] if ratios else []), *curve_tables(measured)]
-    if out is not None:
-        _write(out, report, markdown(report, tables))
     print(json.dumps(report)) if as_json else _print(report, tables)
+    if out is not None:  # after it was shown: what took minutes is not lost to a place that cannot be written to
+        _write(out, report, markdown(report, tables))
 
 
 def _plan(

@@ -111,6 +111,14 @@ def _place(path: Path, out: Path | None, file_format: ExportFormat, *, int8: boo
             code="export_name",
             field="out",
         )
+    others = {one for one in suffixes.values() if one != suffix}
+    if out.resolve() in {exported.export_path(path, one).resolve() for one in others}:
+        raise ConfigError(
+            f"export: expected another name than that of the checkpoint's {''.join(out.suffixes[-2:])} export, found "
+            f"{str(out)!r}",
+            code="export_name",
+            field="out",
+        )
     return suffix, out
 
 
@@ -142,7 +150,7 @@ def _write(
         data, weights = _as_openvino(data, samples)
         write_atomically(exported.weights_path(out), weights)
     write_atomically(out, data)
-    if out == exported.export_path(path, suffix):
+    if out.resolve() == exported.export_path(path, suffix).resolve():
         write_record(path, record.with_export(suffix, exported.checksum(data, weights)))
     return out
 

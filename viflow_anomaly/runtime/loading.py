@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
@@ -152,10 +153,21 @@ def _problem(runtime: RuntimeName, path: Path, wish: _Wish) -> ConfigError | Non
     return _not_installed(runtime, wish) or _nothing_to_run(runtime, path, wish)
 
 
+def _import_problem(runtime: RuntimeName) -> str | None:
+    """Why an installed package cannot be imported (a library of the system is missing, say); None: it can."""
+    try:
+        import_module(runtime)
+    except Exception as err:  # whatever a foreign package raises when it loads
+        return f"{type(err).__name__}: {err}"
+    return None
+
+
 def _not_installed(runtime: RuntimeName, wish: _Wish) -> ConfigError | None:
     """Or it knows neither the device nor the precision."""
+    package = {"openvino": "OpenVINO", "onnxruntime": "ONNX Runtime"}[runtime]
+    if find_spec(runtime) is not None and (problem := _import_problem(runtime)) is not None:
+        return _missing(f"expected {package} for the runtime {runtime!r}, found that it cannot be loaded: {problem}")
     if find_spec(runtime) is None:
-        package = {"openvino": "OpenVINO", "onnxruntime": "ONNX Runtime"}[runtime]
         return _missing(
             f"expected {package} for the runtime {runtime!r}, found it missing: pip install 'viflow-anomaly[{runtime}]'"
         )
