@@ -32,4 +32,6 @@ def describe_access(document: dict[str, Any], refusals: Mapping[int | str, Any])
             # The empty one: a service on loopback may have been started without keys.
             operation["security"] = [{name: [scope] if scope else []} for name in SECURITY_SCHEMES] + [{}]
             for status, answer in refusals.items():
-                operation["responses"].setdefault(str(status), answer)
+                own = operation["responses"].get(str(status), {})  # a full table of streams is a 429, too
+                both = {**answer, **own, "headers": {**answer.get("headers", {}), **own.get("headers", {})}}
+                operation["responses"][str(status)] = both
