@@ -223,7 +223,8 @@ class AnomalyDetector:
         """``detect`` with its maps; same errors. The paper's algorithm on one screen."""
         started = time.perf_counter()
         explained, alignment = self._explain(pair)
-        findings = self._findings(pair, explained)
+        summary = self._summary(explained)
+        findings = self._findings(pair, explained, shares_scene=summary is not None)
         abstained = any(finding.abstain for finding in findings)
         judged = None if abstained else self._judge(explained, alignment)
         if judged is not None and not judged.maps.finite:
@@ -255,7 +256,7 @@ class AnomalyDetector:
             model=self.model_info,
             rois=rois,
             region_analyzed=AnalyzedRegion(x=x, y=y, width=region_width, height=region_height),
-            residual=self._summary(explained),
+            residual=summary,
             timings_ms=timings_ms,
         )
         learned = alignment is not None
@@ -264,11 +265,11 @@ class AnomalyDetector:
         maps = (residual, evidence, explained.inside, explained.reconstruction, explained.target_coordinates)
         return Analysis(detection, *maps, explained.predicted, learned=learned)
 
-    def _findings(self, pair: FramePair, explained: Explanation) -> tuple[Finding, ...]:
+    def _findings(self, pair: FramePair, explained: Explanation, *, shares_scene: bool) -> tuple[Finding, ...]:
         """What can be said against the pair, and whether it can be judged at all."""
         window, predicted = explained.model_input.window, explained.predicted
         findings = _judge_input(pair, window, self.config)
-        if self._summary(explained) is None:
+        if not shares_scene:
             finite = bool(np.isfinite(predicted.flow_px).all())
             return (*findings, Finding(NOTHING_IN_COMMON if finite else NOT_FINITE, abstain=True))
         if any(finding.abstain for finding in findings):
