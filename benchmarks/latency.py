@@ -29,6 +29,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import cv2
 import numpy as np
 
+from viflow_anomaly.alignment import align, remaining_evidence
 from viflow_anomaly.allocator import keep_freed_memory
 from viflow_anomaly.checkpoint_record import source_commit, write_atomically
 from viflow_anomaly.cli.pair_files import PairFiles, load_pair
@@ -52,7 +53,7 @@ CAMERAS = ("none", "pinhole", "radtan")
 EUROC_HEIGHT_PX, EUROC_FOCAL_PX = 480, (458.654, 457.296)
 EUROC_RADTAN = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
 MIN_REPEATS = 50
-STAGES = ("view", "network", "correction", "reconstruct", "cues", "head", "regions")
+STAGES = ("view", "network", "correction", "align", "reconstruct", "cues", "head", "regions")
 
 
 @dataclass(frozen=True)
@@ -124,10 +125,13 @@ class Stages:
         focal_px = self._record.model.view.focal_px
         predicted = correct(hypotheses, model_input, self._config.correction, focal_px=focal_px)
         lap()
-        explained = explain(pair, model_input, predicted, self._config)
+        takes = takes_head(self._head, predicted, self._config)
+        alignment = align(pair, model_input, predicted, focal_px=focal_px) if takes else None
         lap()
-        takes = takes_head(self._head, explained, self._config)
-        cues = evidence_cues(explained, focal_px=focal_px) if takes else None
+        coordinates = None if alignment is None else alignment.target_coordinates
+        explained = explain(pair, model_input, predicted, self._config, coordinates=coordinates)
+        lap()
+        cues = None if alignment is None else evidence_cues(remaining_evidence(explained, alignment))
         lap()
         judged = None if cues is None else judge_cues(self._head, cues, explained)
         lap()
