@@ -133,9 +133,10 @@ def _choose(path: Path, wish: _Wish) -> RuntimeName:
         return wish.runtime
     if wish.device != "cpu":
         return _choose(path, wish._replace(runtime="torch"))
-    problems = {name: _problem(name, path, wish) for name in _BY_SPEED}
-    for name, problem in problems.items():
-        if problem is None:
+    problems: dict[RuntimeName, ConfigError | None] = {}
+    for name in _BY_SPEED:  # one after the other: asking a runtime imports it
+        problems[name] = _problem(name, path, wish)
+        if problems[name] is None:
             return name
     installed = [name for name in _BY_SPEED if name == "torch" or find_spec(name) is not None]
     told = problems[installed[0]]
