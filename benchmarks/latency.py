@@ -253,18 +253,24 @@ def parse_arguments() -> argparse.Namespace:
     return arguments
 
 
+def sample_and_detector(
+    folder: Path, checkpoint: Path | None, runtime: RuntimeName
+) -> tuple[FramePair, AnomalyDetector]:
+    """What is measured; what cannot be loaded ends the program with one line."""
+    files = PairFiles(folder / "source.png", folder / "target.png", folder / "imu.json", folder / "camera.json")
+    try:
+        sample, _ = load_pair(files, limits=ImageLimits())
+        return sample, AnomalyDetector.from_checkpoint(checkpoint, runtime=runtime, threads=1)
+    except ViflowError as err:
+        raise SystemExit(f"error: {err.message} [{err.code}]") from err
+
+
 def main() -> None:
     arguments = parse_arguments()
     cv2.setNumThreads(1)
     keep_freed_memory()  # as the command line and the service do
     load_before = os.getloadavg()[0]
-    folder = arguments.sample
-    files = PairFiles(folder / "source.png", folder / "target.png", folder / "imu.json", folder / "camera.json")
-    try:
-        sample, _ = load_pair(files, limits=ImageLimits())
-        detector = AnomalyDetector.from_checkpoint(arguments.checkpoint, runtime=arguments.runtime, threads=1)
-    except ViflowError as err:
-        raise SystemExit(f"error: {err.message} [{err.code}]") from err
+    sample, detector = sample_and_detector(arguments.sample, arguments.checkpoint, arguments.runtime)
     stages = Stages(arguments.checkpoint, detector, arguments.runtime)
     results = []
     for width, height in SIZES:

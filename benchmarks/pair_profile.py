@@ -30,14 +30,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
-from latency import CAMERAS, ROOT, SIZES, Case, circumstances, make_case
+from latency import CAMERAS, ROOT, SIZES, Case, circumstances, make_case, sample_and_detector
 
 from viflow_anomaly.allocator import keep_freed_memory
 from viflow_anomaly.checkpoint_record import write_atomically
-from viflow_anomaly.cli.pair_files import PairFiles, load_pair
-from viflow_anomaly.config import ImageLimits, RuntimeName
+from viflow_anomaly.config import RuntimeName
 from viflow_anomaly.detector import AnomalyDetector
-from viflow_anomaly.errors import ViflowError
 
 PARTS = (
     "model_input.prepare",
@@ -64,7 +62,6 @@ PARTS = (
     "evidence_cues.evidence_cues",
     "measured_flow.measure_remaining_flow",
     "measured_flow._local_flow",
-    "evidence_cues._depth_on_blocks",
     "motion_refinement.common_motion_px",
     "motion_evidence.judge_cues",
     "runtime.openvino_evidence.OpenvinoEvidence.judge",
@@ -202,13 +199,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     keep_freed_memory()  # as the command line and the service do
     load_before = os.getloadavg()[0]
-    folder = arguments.sample
-    files = PairFiles(folder / "source.png", folder / "target.png", folder / "imu.json", folder / "camera.json")
-    try:
-        sample, _ = load_pair(files, limits=ImageLimits())
-        detector = AnomalyDetector.from_checkpoint(arguments.checkpoint, runtime=arguments.runtime, threads=1)
-    except ViflowError as err:
-        raise SystemExit(f"error: {err.message} [{err.code}]") from err
+    sample, detector = sample_and_detector(arguments.sample, arguments.checkpoint, arguments.runtime)
     results = [
         profile(make_case(sample, *size, camera), detector, repeats=arguments.repeats, warm_up=arguments.warm_up)
         for size in SIZES

@@ -48,6 +48,17 @@ class KeepClear:
         return True
 
 
+def spot_ahead(
+    rng: np.random.Generator, camera_poses: Float64Array, *, nearest_m: float, farthest_m: float
+) -> Float64Array:
+    """[3] on the ground before one of the camera poses [F, 4, 4], near ones as often as far ones."""
+    pose = camera_poses[int(rng.integers(len(camera_poses)))]
+    distance = float(np.exp(rng.uniform(np.log(nearest_m), np.log(farthest_m))))
+    ahead = pose[:3, :3] @ np.array([rng.uniform(-0.9, 0.9), 0.0, 1.0])
+    bearing = float(np.arctan2(ahead[1], ahead[0]))
+    return np.array([*(pose[:2, 3] + distance * np.array([np.cos(bearing), np.sin(bearing)])), 0.0])
+
+
 def object_materials(rng: np.random.Generator, count: int) -> tuple[Material, ...]:
     return tuple(
         Material(

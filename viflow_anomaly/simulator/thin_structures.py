@@ -32,12 +32,8 @@ def beside_the_path(
     """``count`` things in what a drone sees: before a camera pose of [F, 4, 4], near ones as often as far ones."""
 
     def place() -> tuple[Float64Array, Float64Array]:
-        pose = camera_poses[int(rng.integers(len(camera_poses)))]
-        distance = float(np.exp(rng.uniform(np.log(NEAREST_M), np.log(FARTHEST_M))))
-        ahead = pose[:3, :3] @ np.array([rng.uniform(-0.9, 0.9), 0.0, 1.0])
-        bearing = float(np.arctan2(ahead[1], ahead[0]))
-        spot = pose[:2, 3] + distance * np.array([np.cos(bearing), np.sin(bearing)])
-        return np.array([*spot, 0.0]), turned(float(rng.uniform(0, 2 * np.pi)))
+        spot = surroundings.spot_ahead(rng, camera_poses, nearest_m=NEAREST_M, farthest_m=FARTHEST_M)
+        return spot, turned(float(rng.uniform(0, 2 * np.pi)))
 
     clear = KeepClear.around(camera_poses[:, :3, 3], movers, clearance_m=surroundings.CLEARANCE_M)
     return _placed(rng, count, place, clear, materials)
