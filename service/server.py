@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import socket
 from typing import TYPE_CHECKING, Final
 
@@ -15,6 +14,7 @@ import uvicorn
 
 from viflow_anomaly.allocator import keep_freed_memory
 from viflow_anomaly.errors import ConfigError
+from viflow_anomaly.idle_threads import keep_idle_threads_from_spinning
 from viflow_anomaly_service.access_rules import require_keys_or_loopback
 from viflow_anomaly_service.api_keys import read_key_file
 from viflow_anomaly_service.connection_guard import guarded_protocol
@@ -36,8 +36,8 @@ FAREWELL_SECONDS: Final = 3
 def run(settings: ServiceSettings, *, load_detector: DetectorLoader | None = None) -> None:
     """Serve until SIGINT or SIGTERM; running requests get ``shutdown_timeout_s`` to finish.
 
-    Takes the process over: its log goes to stderr as JSON lines, and idle OpenMP threads are told to sleep (which
-    has an effect only if torch was not imported before).
+    Takes the process over: its log goes to stderr as JSON lines, and idle threads are kept from spinning (which
+    has an effect only if numpy and torch were not imported before).
 
     Args:
         load_detector: the bundled or configured one when not given; called in every serving process.
@@ -51,7 +51,7 @@ def run(settings: ServiceSettings, *, load_detector: DetectorLoader | None = Non
     require_keys_or_loopback(settings)
     if settings.key_file is not None:
         read_key_file(settings.key_file)  # before processes are started that would each fail on it
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    keep_idle_threads_from_spinning()
     keep_freed_memory()
     configure_logging(settings.log_level)
     stop = StopSignals()

@@ -16,7 +16,7 @@ from viflow_anomaly.motion_input import MotionWindow
 from viflow_anomaly.sensor_data import Float64Array, PinholeCamera, Uint8Array
 from viflow_anomaly.view import make_view
 
-WIDTH, HEIGHT = 320, 224
+WIDTH, HEIGHT = 384, 256
 FOCAL_PX = 116.0
 CONFIG = DetectorConfig(photometric_compensation=False)
 

@@ -19,14 +19,17 @@ from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.sensor_data import Float64Array
 
 ROUNDS = 4
-LATTICE_BLOCKS = 2
+LATTICE_POINTS = 800
+"""Six parameters need no more blocks than about so many, evenly spread..."""
+MIN_LATTICE_BLOCKS = 2
+"""...and neighbours err alike: every second block says what all of them do."""
 MIN_TOLERANCE_PX = 0.5
 """Errors of this size are half trusted at least; more where most of the picture is off by more."""
 ROTATION_SIGMA_RAD, TRANSLATION_SIGMA = 0.004, 0.05
 """How far the corrected motion may still be off; the translation in the view's unit of length."""
 NOISE_PX = 1.0
-CORRELATED_BLOCKS = 9.0
-"""Neighbours err alike: so many count as one."""
+CORRELATED_BLOCKS = 36.0
+"""So many neighbours count as one."""
 FREE_PARALLAX_PX = 1.0
 """From here on a wrong depth explains as much along the line as a wrong motion does."""
 
@@ -53,7 +56,7 @@ def common_motion_px(
 ) -> Float32Array:
     """The part of a remaining flow that a small motion of the camera explains, [h, w, 2] float32 in source pixels.
 
-    One linear problem of six parameters, reweighted (Cauchy) ``ROUNDS`` times, on every ``LATTICE_BLOCKS``-th block.
+    One linear problem of six parameters, reweighted (Cauchy) ``ROUNDS`` times, on a lattice of blocks.
 
     Args:
         flow_px: [h, w, 2] in source pixels.
@@ -62,7 +65,8 @@ def common_motion_px(
         line: epipolar lines of the blocks, in source pixels.
         focal_px: of the source image, x and y.
     """
-    thin = (slice(LATTICE_BLOCKS // 2, None, LATTICE_BLOCKS),) * 2
+    pitch = max(MIN_LATTICE_BLOCKS, round((trust.size / LATTICE_POINTS) ** 0.5))
+    thin = (slice(pitch // 2, None, pitch),) * 2
     x, y, nearness = (one[thin].reshape(-1) for one in points)
     along_x, along_y = _basis_px(MovedPoints(x, y, nearness), focal_px)  # 6, N each
     u, v = (flow_px[..., axis][thin].reshape(-1) for axis in (0, 1))
@@ -71,14 +75,14 @@ def common_motion_px(
     rows = np.concatenate([along_y * lx - along_x * ly, along_x * lx + along_y * ly], axis=1)  # 6, 2 N
     goal = np.concatenate([v * lx - u * ly, u * lx + v * ly])
     share = 1 / (1 + (parallax / np.float32(FREE_PARALLAX_PX)) ** 2)
-    trusted = trust[thin].reshape(-1) * np.float32(1 / (NOISE_PX**2 * CORRELATED_BLOCKS))
+    trusted = trust[thin].reshape(-1) * np.float32(pitch**2 / (NOISE_PX**2 * CORRELATED_BLOCKS))
     trusted = np.stack([trusted, trusted * share])
     prior = np.diag(np.repeat([1 / ROTATION_SIGMA_RAD**2, 1 / TRANSLATION_SIGMA**2], 3))
-    solution = np.zeros(6)
+    solution, middle = np.zeros(6), share.size // 2
     for _ in range(ROUNDS):
         across, along = (goal - solution.astype(np.float32) @ rows).reshape(2, -1)
         size = np.sqrt(across * across + along * along * share)
-        tolerance = max(MIN_TOLERANCE_PX, float(np.median(size)))
+        tolerance = max(MIN_TOLERANCE_PX, float(np.partition(size, middle)[middle]))
         robust = 1 / (1 + (size / np.float32(tolerance)) ** 2)
         weighted = rows * (trusted * robust).reshape(-1)
         normal = prior + (weighted @ rows.T).astype(np.float64)

@@ -197,15 +197,22 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
 
 def test_main_keeps_idle_threads_from_spinning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["viflow-anomaly", "--version"])
-    for before, after in ((None, "PASSIVE"), ("ACTIVE", "ACTIVE")):
-        if before is None:
-            monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
-        else:
-            monkeypatch.setenv("OMP_WAIT_POLICY", before)
+    names = ("OMP_WAIT_POLICY", "OPENBLAS_NUM_THREADS")
+    for before, after in (((None, None), ("PASSIVE", "1")), (("ACTIVE", "2"), ("ACTIVE", "2"))):
+        for name, value in zip(names, before, strict=True):
+            monkeypatch.setenv(name, value or "")
+            if value is None:
+                monkeypatch.delenv(name)
         with pytest.raises(SystemExit) as ended:
             cli_main.main()
         assert ended.value.code == 0
-        assert os.environ["OMP_WAIT_POLICY"] == after
+        assert tuple(os.environ[name] for name in names) == after
+
+
+def test_the_console_script_begins_before_numpy_is_imported() -> None:
+    asked = "import sys, viflow_anomaly.cli.main, viflow_anomaly_service.server; print('numpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
 
 
 def test_progress_is_silent_where_nobody_watches(capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,7 +5,6 @@ Exit codes: 0 done, 2 bad usage or input, 3 some pairs of a batch failed, 130 in
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -32,6 +31,7 @@ from viflow_anomaly.cli import (
     train_evidence,
 )
 from viflow_anomaly.errors import ViflowError
+from viflow_anomaly.idle_threads import keep_idle_threads_from_spinning
 
 EXIT_BAD_INPUT = 2
 PROGRAM = "viflow-anomaly"
@@ -114,7 +114,6 @@ def _complain(message: str) -> int:
 
 def main() -> None:
     """The console script."""
-    # Idle OpenMP threads that spin slow every other process down; torch reads this once, when it loads.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    keep_idle_threads_from_spinning()
     keep_freed_memory()
     sys.exit(run(sys.argv[1:]))
