@@ -19,7 +19,7 @@ from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import CheckpointError, ConfigError, DatasetError
 from viflow_anomaly.evidence_cues import GEOMETRIC_CUES
 from viflow_anomaly.evidence_data import IGNORED, MOVING, SEAM, EvidenceBatch, offsets_of
-from viflow_anomaly.evidence_run import train_evidence
+from viflow_anomaly.evidence_run import refit_scores, train_evidence
 from viflow_anomaly.evidence_training import EvidenceTraining, evidence_loss, offset_loss
 from viflow_anomaly.moving_regions import REGION_FEATURES, probability_of
 from viflow_anomaly.region_score_fit import LabelledRegions, fit_region_score
@@ -181,6 +181,32 @@ def test_a_head_is_fitted_where_regions_would_come_from_the_residual(tmp_path: P
     data, calibration = [recording(tmp_path / "drone_1")], [recording(tmp_path / "drone_2")]
     path = train_evidence(data, tmp_path / "out", calibration=calibration, detector=residual, training=SMALL)
     assert load_evidence_head(path).record.region_score.weights
+
+
+def test_scores_are_fitted_anew_and_the_weights_stay(tmp_path: Path, detector: AnomalyDetector) -> None:
+    moved = easily_moved(detector)
+    data, others = [recording(tmp_path / "drone_1")], [recording(tmp_path / "drone_2"), recording(tmp_path / "drone_3")]
+    trained = train_evidence(data, tmp_path / "out", calibration=others[:1], detector=moved, training=SMALL)
+    same = refit_scores(moved, trained, others[:1], tmp_path / "same.safetensors")
+    assert same.read_bytes() == trained.read_bytes()
+    before, after = (load_evidence_head(path).record for path in (trained, same))
+    assert after.region_score == before.region_score
+    refitted = load_evidence_head(refit_scores(moved, trained, others, tmp_path / "other.safetensors")).record
+    assert refitted.region_score != before.region_score
+    assert refitted.provenance["calibration"]["recordings"] == 2
+    assert refitted.provenance["training"] == before.provenance["training"]
+
+
+def test_scores_are_not_fitted_on_nothing_or_written_nowhere(tmp_path: Path, detector: AnomalyDetector) -> None:
+    one = [recording(tmp_path / "drone_1")]
+    for recordings, out, code in (
+        ([], tmp_path / "head.safetensors", "config_invalid"),
+        (one, tmp_path / "missing" / "head.safetensors", "output_unusable"),
+        (one, tmp_path / "head.json", "output_unusable"),
+    ):
+        with pytest.raises(ConfigError) as caught:
+            refit_scores(detector, None, recordings, out)
+        assert caught.value.code == code
 
 
 def test_a_file_is_no_place_for_a_training(tmp_path: Path, detector: AnomalyDetector) -> None:

@@ -11,7 +11,7 @@ import torch
 
 from viflow_anomaly import __version__
 from viflow_anomaly.batch import require_device
-from viflow_anomaly.checkpoint import save_evidence_head
+from viflow_anomaly.checkpoint import LoadedEvidenceHead, load_evidence_head, save_evidence_head
 from viflow_anomaly.checkpoint_record import BUNDLED_EVIDENCE_NAME, EvidenceRecord, source_commit
 from viflow_anomaly.config import EvidenceTrainingConfig
 from viflow_anomaly.detection import ModelInfo
@@ -87,7 +87,42 @@ def train_evidence(
         )
         _run_steps(run, EvidenceData(examples, training), out_dir, fingerprint, report)
     record = _record(training, detector.model_info, data, calibration)
-    return _with_scores(run, record, out_dir / "evidence.safetensors", detector, calibration, report)
+    head = LoadedEvidenceHead(run.network.eval(), record)
+    return _with_scores(head, out_dir / "evidence.safetensors", detector, calibration, report, device=device)
+
+
+def refit_scores(
+    detector: AnomalyDetector,
+    head: Path | None,
+    calibration: Sequence[Path],
+    out: Path,
+    *,
+    report: Report = lambda what, done, total: None,
+) -> Path:
+    """Write a head with the same weights, and scores fitted on these recordings.
+
+    Args:
+        detector: whose network and regions the scores are to hold for.
+        head: None: the bundled one.
+        calibration: recordings with masks of what moves, that the head was not trained on.
+        out: the new checkpoint (.safetensors).
+
+    Raises:
+        CheckpointError: as ``load_evidence_head``; ``evidence_cues_differ``.
+        ConfigError: ``config_invalid`` where there are no recordings; ``output_unusable``.
+        DatasetError: as ``labelled_regions``.
+    """
+    if out.suffix != ".safetensors" or not out.parent.is_dir():
+        raise ConfigError(
+            f"{out}: expected a file in an existing folder whose name ends in .safetensors",
+            code="output_unusable",
+            field="out",
+        )
+    _require_some("calibration", calibration)
+    loaded = load_evidence_head(head)
+    provenance = {**loaded.record.provenance, "scores_commit": source_commit(), "calibration": _told(calibration)}
+    record = loaded.record.model_copy(update={"provenance": provenance})
+    return _with_scores(loaded._replace(record=record), out, detector, calibration, report)
 
 
 def _run_steps(
@@ -155,8 +190,7 @@ def _log(path: Path, step: int, loss: float) -> None:
 
 def _require_apart(data: Sequence[Path], calibration: Sequence[Path]) -> None:
     for name, some in (("data", data), ("calibration", calibration)):
-        if not some:
-            raise ConfigError(f"{name}: expected recordings, found none", code="config_invalid", field=name)
+        _require_some(name, some)
     shared = sorted({path.name for path in data} & {path.name for path in calibration})
     if shared:
         raise ConfigError(
@@ -166,16 +200,23 @@ def _require_apart(data: Sequence[Path], calibration: Sequence[Path]) -> None:
         )
 
 
+def _require_some(name: str, recordings: Sequence[Path]) -> None:
+    if not recordings:
+        raise ConfigError(f"{name}: expected recordings, found none", code="config_invalid", field=name)
+
+
 def _with_scores(
-    run: EvidenceTraining,
-    record: EvidenceRecord,
+    head: LoadedEvidenceHead,
     path: Path,
     detector: AnomalyDetector,
     calibration: Sequence[Path],
     report: Report,
+    *,
+    device: str = "cpu",
 ) -> Path:
     """Write the checkpoint with what its regions score, fitted on recordings that it has not seen."""
-    runtime = TorchEvidence(run.network.eval(), device=run.device)
+    record = head.record
+    runtime = TorchEvidence(head.head, device=device)
     judging = detector.with_evidence(LoadedEvidence(runtime, record))
     regions = labelled_regions(
         judging.with_config(detector.config.model_copy(update={"evidence": "learned"})),
@@ -189,4 +230,4 @@ def _with_scores(
             "provenance": {**record.provenance, "calibrated_on": counts},
         }
     )
-    return save_evidence_head(path, run.network, scored)
+    return save_evidence_head(path, head.head, scored)

@@ -16,6 +16,7 @@ from viflow_anomaly.config import EVIDENCE_BLOCK_PX, RegionConfig, RegionScore
 from viflow_anomaly.evidence_cues import GEOMETRIC_CUES, HALF_PARALLAX_PX, HALF_REMAINING_PX, EvidenceCues
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.grouping import things_of_pixels
+from viflow_anomaly.peaks import divided_at_valleys
 from viflow_anomaly.regions import (
     BoolArray,
     BoundingBox,
@@ -155,7 +156,8 @@ def _judge(measured: MeasuredRegion, residual: Float32Array, score: RegionScore,
 
 
 def _things(maps: MotionMaps, mask: BoolArray, part: tuple[slice, slice], config: RegionConfig) -> LabelArray:
-    """[h, w] things (1..) in a part of the image: those that somewhere probably move, divided, and the faint ones.
+    """[h, w] things (1..) in a part of the image: those that somewhere probably move, divided by where their middles
+    are and at valleys of the probability, and the faint ones.
 
     A faint thing is what reaches ``faint_motion_probability`` and has no more than a speck that is certain; small and
     slow things are no more than that. It is neither cut along seams nor divided.
@@ -168,6 +170,7 @@ def _things(maps: MotionMaps, mask: BoolArray, part: tuple[slice, slice], config
     faint = label_components(mask, connectivity=2)  # type: ignore[no-untyped-call]
     is_new = np.bincount(faint[certain], minlength=int(faint.max()) + 1) < config.min_area_fraction * maps.motion.size
     is_new[0] = False
+    things = divided_at_valleys(things, maps.motion[part])
     return np.where(is_new[faint], faint + things.max(), things)
 
 
