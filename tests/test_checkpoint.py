@@ -292,3 +292,15 @@ def test_nothing_but_a_file_is_written_over(tmp_path: Path) -> None:
         write_atomically(tmp_path / "folder", b"x")
     with pytest.raises(OSError, match="expected a file or nothing there"):
         write_atomically(Path("/dev/null"), b"x")
+
+
+def test_what_cannot_be_written_is_told_by_its_own_name(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(OSError, match="File exists") as caught:
+        write_atomically(tmp_path / "file" / "picture.png", b"x")
+    assert caught.value.filename == str(tmp_path / "file")
+    path = tmp_path / ("n" * 240 + ".png")  # short enough, but not with what is added while it is written
+    with pytest.raises(OSError, match="too long") as caught:
+        write_atomically(path, b"x")
+    assert caught.value.filename == str(path)
+    assert [one.name for one in tmp_path.iterdir()] == ["file"]

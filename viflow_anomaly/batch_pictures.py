@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from viflow_anomaly.batch_files import OVERLAYS_NAME, VIDEO_FRAMES_NAME, VIDEO_NAME
+from viflow_anomaly.checkpoint_record import write_atomically
 from viflow_anomaly.config import ImageLimits
 from viflow_anomaly.detection import Detection
 from viflow_anomaly.drawing import OverlayVideo, draw_overlay
@@ -124,6 +125,4 @@ def write_png(path: Path, picture: Uint8Array) -> None:
         OSError: the disk is full or the folder cannot be written.
     """
     _, data = cv2.imencode(".png", picture)
-    temporary = path.with_name(f".{path.name}.new")
-    temporary.write_bytes(data.tobytes())
-    temporary.replace(path)
+    write_atomically(path, data.tobytes())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import json
@@ -102,7 +103,11 @@ def bundled_checkpoint() -> Path:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write beside ``path`` and rename, so that nobody ever sees half a file."""
+    """Write beside ``path`` and rename, so that nobody ever sees half a file.
+
+    Raises:
+        OSError: naming ``path`` or its folder: a full disk, a folder that cannot be made or written.
+    """
     if path.exists() and not path.is_file():
         raise OSError(errno.EINVAL, "expected a file or nothing there, found a directory or a device", str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -110,8 +115,11 @@ def write_atomically(path: Path, data: bytes) -> None:
     try:
         temporary.write_bytes(data)
         temporary.replace(path)
+    except OSError as err:
+        raise OSError(err.errno, err.strerror, str(path)) from err
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
 
 
 def write_record(path: Path, record: TensorRecord) -> None:

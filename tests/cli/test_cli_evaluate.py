@@ -237,6 +237,12 @@ def test_a_result_that_cannot_be_written(ask: Ask, recordings: list[Path], check
     assert answer.is_refusal(f"{tmp_path.name}: expected the name of a file to write, found a directory")
 
 
+@pytest.mark.parametrize("group", ["evaluate", "groundtruth", "keys"])
+def test_a_group_without_a_command_says_what_is_missing(ask: Ask, group: str) -> None:
+    answer = ask([group])
+    assert answer.is_refusal(f"expected a command, found none (try 'viflow-anomaly {group} --help')")
+
+
 @pytest.mark.parametrize("arguments", [["evaluate"], ["evaluate", "flow"], ["evaluate", "detect"]])
 def test_help_shows_examples(ask: Ask, arguments: list[str]) -> None:
     answer = ask([*arguments, "--help"])

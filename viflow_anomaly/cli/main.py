@@ -98,7 +98,7 @@ def run(arguments: Sequence[str]) -> int:
     except TyperException as err:
         context = getattr(err, "ctx", None)
         hint = f" (try '{context.command_path} --help')" if context else ""
-        return _complain(err.format_message() + hint)
+        return _complain((err.format_message() or "expected a command, found none") + hint)
     except ViflowError as err:
         return _complain(f"{err.message} [{err.code}]")
     except RecursionError:
