@@ -254,8 +254,14 @@ def test_missing_camera_file(ask: Ask, pair: PairFolder) -> None:
     assert ask(pair.arguments("--camera", "nowhere.json")).is_refusal("nowhere.json: expected a camera.json")
 
 
-def test_overlay_into_a_folder_that_is_not_there(ask: Ask, pair: PairFolder, tmp_path: Path) -> None:
-    assert ask(pair.arguments("--overlay", str(tmp_path / "no" / "out.png"))).is_refusal("No such file or directory")
+def test_the_folder_of_an_overlay_is_made_and_what_cannot_be_made_is_named(
+    ask: Ask, pair: PairFolder, tmp_path: Path
+) -> None:
+    assert ask(pair.arguments("--overlay", str(tmp_path / "new" / "out.png"))).code == 0
+    assert [one.name for one in (tmp_path / "new").iterdir()] == ["out.png"]
+    answer = ask(pair.arguments("--overlay", str(tmp_path / "new" / "out.png" / "out.png")))
+    assert answer.code == 2
+    assert f"{tmp_path / 'new' / 'out.png'}: File exists" in answer.err
 
 
 def test_wrong_settings(ask: Ask, pair: PairFolder) -> None:
