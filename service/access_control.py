@@ -48,7 +48,7 @@ def add_access_control(app: FastAPI, settings: ServiceSettings) -> None:
         app.add_middleware(
             CORSMiddleware,
             allow_origins=settings.allowed_origins,
-            allow_methods=("GET", "POST", "DELETE"),
+            allow_methods=("GET", "POST", "PUT", "DELETE"),
             allow_headers=CORS_HEADERS,
             expose_headers=EXPOSED_HEADERS,
             max_age=600,

@@ -50,7 +50,7 @@ class ServiceMetrics:
             buckets=SECONDS,
             registry=registry,
         )
-        self.detections = Counter("viflow_detections", "Judged pairs", ("status",), registry=registry)
+        self.detections = Counter("viflow_detections", "Judged pairs", ("model", "status"), registry=registry)
         self.regions = Counter("viflow_regions", "Regions in the answers", ("label",), registry=registry)
         self.reasons = Counter(
             "viflow_reasons",
@@ -79,10 +79,11 @@ class ServiceMetrics:
         self._model = Gauge(
             "viflow_model_info",
             "1; which weights answer",
-            ("name", "version", "sha256", "schema_version"),
+            ("served_as", "name", "version", "sha256", "schema_version"),
             registry=registry,
             multiprocess_mode="livemax",
         )
+        self.model_loads = Counter("viflow_model_loads", "Models loaded by request", ("result",), registry=registry)
 
     @property
     def registry(self) -> CollectorRegistry:
@@ -100,8 +101,9 @@ class ServiceMetrics:
         self.requests.labels(route, method if method in _METHODS else "other", str(status)).inc()
         self.request_seconds.labels(route).observe(seconds)
 
-    def observe_detection(self, detection: Detection) -> None:
-        self.detections.labels(detection.status).inc()
+    def observe_detection(self, detection: Detection, model: str) -> None:
+        """One judged pair; ``model``: the name that the model is served as."""
+        self.detections.labels(model, detection.status).inc()
         for roi in detection.rois:
             self.regions.labels(roi.label).inc()
         for reason in detection.reasons:
@@ -116,9 +118,12 @@ class ServiceMetrics:
         if code.startswith("imu_") or code in _OTHER_IMU_FAULTS:
             self.imu_faults.labels(code).inc()
 
-    def observe_model(self, model: ModelInfo) -> None:
-        self._model.labels(model.name, model.version, model.sha256, SCHEMA_VERSION).set(1)
-        self.ready.set(1)
+    def observe_model(self, served_as: str, model: ModelInfo) -> None:
+        self._model.labels(served_as, model.name, model.version, model.sha256, SCHEMA_VERSION).set(1)
+
+    def forget_model(self, served_as: str, model: ModelInfo) -> None:
+        """It is not loaded any more; in one process only, where its names could become many."""
+        self._model.remove(served_as, model.name, model.version, model.sha256, SCHEMA_VERSION)
 
     def observe_memory(self) -> None:
         """Called now and then: with several workers, one that is not asked must have said it before."""

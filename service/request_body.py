@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Coroutine
+from collections.abc import AsyncIterator, Coroutine
+from http import HTTPStatus
 from typing import Any, Final, TypeVar
 
 from starlette.requests import ClientDisconnect, Request
@@ -100,6 +101,18 @@ class RequestBody:
         self.finished = not message.get("more_body", False)
         chunk: bytes = message.get("body", b"")
         return chunk
+
+
+@contextlib.asynccontextmanager
+async def answered(body: RequestBody) -> AsyncIterator[None]:
+    """A refusal inside is one that the client can read: what it still sends is swallowed before."""
+    try:
+        yield
+    except Problem as problem:
+        if problem.status != HTTPStatus.REQUEST_TIMEOUT:
+            await body.discard()
+        problem.closes_connection = not body.finished
+        raise
 
 
 def _too_large(max_bytes: int, found: str) -> Problem:

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import json
 import time
-from http import HTTPStatus
 
 from fastapi import FastAPI, Request, Response
 from fastapi.responses import JSONResponse
@@ -14,7 +13,7 @@ from fastapi.responses import JSONResponse
 from viflow_anomaly_service.detect_endpoint import JSON_MEDIA_TYPE, accepted_content_type
 from viflow_anomaly_service.detector_pool import DeadlinePassedError
 from viflow_anomaly_service.problems import Problem
-from viflow_anomaly_service.request_body import RequestBody
+from viflow_anomaly_service.request_body import RequestBody, answered
 from viflow_anomaly_service.request_log import log_fields
 from viflow_anomaly_service.service_core import ServiceCore
 from viflow_anomaly_service.store.query import STREAM_ID
@@ -36,13 +35,8 @@ def add_streams(app: FastAPI, core: ServiceCore) -> None:
     async def add_frame(request: Request, stream_id: str) -> Response:
         """A frame, IMU samples or both; the detections of the pairs that can be judged now."""
         body = RequestBody(request)
-        try:
+        async with answered(body):
             answer = await _answer(core, request, body, stream_id)
-        except Problem as problem:
-            if problem.status != HTTPStatus.REQUEST_TIMEOUT:
-                await body.discard()
-            problem.closes_connection = not body.finished
-            raise
         return Response(answer, media_type=JSON_MEDIA_TYPE)
 
     @app.get("/streams", operation_id="listStreams", tags=["streams"], **LIST_OPERATION)
@@ -93,12 +87,10 @@ async def _answer(core: ServiceCore, request: Request, body: RequestBody, stream
         raise Problem(422, code="stream_id_invalid", detail=detail, field="stream_id")
     core.gate.require_open()
     try:
-        detector = core.slot.require()
+        models = core.models.require()
     except Problem:
         core.metrics.shed.labels("not_ready").inc()
         raise
-    if detector.motor_source is not None:
-        raise Problem(501, code="streams_motor_unsupported", detail="expected a model without motor input, found one")
     if core.keeper is not None:
         core.keeper.require_usable()  # before a pair is judged for nothing
     content_type, settings = accepted_content_type(request), core.settings
@@ -106,12 +98,11 @@ async def _answer(core: ServiceCore, request: Request, body: RequestBody, stream
         started = time.perf_counter()
         data = await body.read(max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
         core.metrics.observe_stage("upload", time.perf_counter() - started)
-        known = None if stream.setup is None or stream.stream is None else (stream.setup, stream.stream)
         work = StreamWork(
-            detector,
+            models,
             data,
             content_type,
-            known=known,
+            known=stream.begun,
             state=stream.state,
             settings=settings,
             metrics=core.metrics,
@@ -145,8 +136,8 @@ async def _kept(core: ServiceCore, stream: LiveStream, judged: JudgedCall) -> by
     if core.keeper is not None:
         pairs = list(zip(step.detections, judged.bodies, strict=True))
         ids = await core.keeper.keep(pairs, stream_id=stream.stream_id, session_id=stream.session_id)
-    begun = stream.setup is None
-    core.streams.advance(stream, judged.setup, judged.stream, step)
+    begun = stream.begun is None
+    core.streams.advance(stream, judged.begun, step)
     if received.frame is not None:
         stream.received_frames += 1
     if received.imu is not None:
