@@ -21,7 +21,8 @@ MULTIPROCESS_VARIABLE: Final = "PROMETHEUS_MULTIPROC_DIR"
 ShedReason = Literal["queue_full", "deadline", "shutting_down", "not_ready"]
 Stage = Literal["upload", "queue", "decode", "detect", "encode", "store"]
 SECONDS: Final = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
-_METHODS: Final = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+_METHODS: Final = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS", "MESSAGE"})
+"""``MESSAGE``: of a WebSocket."""
 _OTHER_IMU_FAULTS: Final = frozenset({"interval_too_long", "mounting_unknown", "no_accelerometer"})
 """Codes of the IMU's faults that do not say so in their name."""
 

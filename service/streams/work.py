@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
@@ -22,8 +22,11 @@ from viflow_anomaly_service.metrics import ServiceMetrics, Stage
 from viflow_anomaly_service.models.table import LoadedModel, ModelSet
 from viflow_anomaly_service.problems import Problem, problem_of_error, problem_of_validation
 from viflow_anomaly_service.settings import ServiceSettings
-from viflow_anomaly_service.streams.request import StreamInput, read_input
+from viflow_anomaly_service.streams.request import StreamInput
 from viflow_anomaly_service.streams.schemas import StreamSetup
+
+Reading = Callable[[], StreamInput]
+"""Of what one call sent; it may take a while, and raises Problem."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +82,7 @@ class StreamWork:
 
     Args:
         models: those that were there when the call came; one of them begins a stream.
-        body: the whole body; let go of once it is decoded.
-        content_type: of the body.
+        read: makes the library's values of what was sent; let go of after that.
         known: what an earlier call has begun.
         state: where the stream stands.
         settings: limits.
@@ -93,8 +95,7 @@ class StreamWork:
     def __init__(
         self,
         models: ModelSet,
-        body: bytes,
-        content_type: str,
+        read: Reading,
         *,
         known: BegunStream | None,
         state: StreamState,
@@ -102,8 +103,7 @@ class StreamWork:
         metrics: ServiceMetrics,
     ) -> None:
         self._models = models
-        self._body = body
-        self._content_type = content_type
+        self._read: Reading | None = read
         self._known = known
         self._state = state
         self._settings = settings
@@ -119,8 +119,9 @@ class StreamWork:
         """
         self._note("queue", job.waited_s)
         with self._stage("decode"):
-            received = read_input(self._body, self._content_type, self._settings)
-            self._body = b""
+            assert self._read is not None  # noqa: S101 - called once
+            received = self._read()
+            self._read = None
             begun = self._stream_of(received)
         job.require_wanted()
         with self._stage("detect"):
