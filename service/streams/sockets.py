@@ -243,20 +243,19 @@ class Inbox:
         """
         if self._closing.is_set():
             raise ClosingError(GOING_AWAY, "shutting_down")
-        coming = [asyncio.ensure_future(one) for one in (self._messages.get(), self.left.wait(), self._closing.wait())]
+        message = asyncio.ensure_future(self._messages.get())
+        left, closing = (asyncio.ensure_future(one.wait()) for one in (self.left, self._closing))
         try:
-            await asyncio.wait(coming, timeout=patience_s, return_when=asyncio.FIRST_COMPLETED)
-            message, left, closing = coming
+            await asyncio.wait({message, left, closing}, timeout=patience_s, return_when=asyncio.FIRST_COMPLETED)
             if message.done() and not left.done():
-                found: str | bytes = message.result()
-                return found
+                return message.result()
             if left.done():
                 raise ClientDisconnect
             if closing.done():
                 raise ClosingError(GOING_AWAY, "shutting_down")
             raise ClosingError(POLICY, reason)
         finally:
-            for one in coming:
+            for one in (message, left, closing):
                 one.cancel()
 
     async def _fill(self) -> None:
