@@ -37,6 +37,11 @@ class GuardedSocket(WebSocketsSansIOProtocol):
         await super().run_asgi()
         self.loop.call_later(self.close_timeout + LINGER_SECONDS, self.transport.abort)
 
+    async def send(self, message: Any) -> None:
+        await super().send(message)
+        if message["type"] == "websocket.http.response.body" and self.close_sent:
+            self.handshake_complete = True  # or it would log the refusal, which is whole, as a fault of ours
+
     def shutdown(self) -> None:
         """The application, which knows that the service ends, answers what it has and closes with 1001."""
         if not self.handshake_complete or self.close_sent:

@@ -113,7 +113,7 @@ def test_javascript_over_a_websocket(service: tuple[str, dict[str, str]], tmp_pa
     service_says = httpx.get(f"{url}/streams/cam0", headers={"X-API-Key": keys["drone"]}, trust_env=False).json()
     assert service_says["newest_frame_ns"] == 1_700_000_000_350_000_001
     done = subprocess.run([*command, keys["reader"]], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert json.loads(done.stdout)["code"] == 1006
+    assert "opened" not in done.stdout
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node")

@@ -572,5 +572,6 @@ def test_no_key_and_no_query_string_in_the_log(tmp_path: Path, world: World) -> 
         wait_until(lambda: len(serving.events("websocket")) == 2)
         written = json.dumps(serving.log) + "".join(serving.other_lines)
     assert serving.events("websocket")[0]["key"] == "drone"
+    assert not [record for record in serving.log if record["level"] == "error"]
     for secret in (key, "hidden"):
         assert secret not in written
