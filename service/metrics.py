@@ -84,7 +84,6 @@ class ServiceMetrics:
             registry=registry,
             multiprocess_mode="livemax",
         )
-        self.model_loads = Counter("viflow_model_loads", "Models loaded by request", ("result",), registry=registry)
 
     @property
     def registry(self) -> CollectorRegistry:

@@ -193,11 +193,15 @@ class StreamTable:
         """Forget what was idle for too long."""
         while True:
             await asyncio.sleep(min(LOOK_SECONDS, self._settings.stream_idle_s / 2))
-            now = time.monotonic()
-            for stream in list(self._streams.values()):
-                if not stream.calls and now - stream.used_at > self._settings.stream_idle_s:
-                    self.forget(stream)
-                    logger.info("stream_expired", extra={"stream": stream.stream_id, "pairs": stream.judged_pairs})
+            self._forget_idle()
+
+    def _forget_idle(self) -> None:
+        """Apart from the loop, which would keep the last stream that it looked at while it sleeps: images, model."""
+        now = time.monotonic()
+        for stream in list(self._streams.values()):
+            if not stream.calls and now - stream.used_at > self._settings.stream_idle_s:
+                self.forget(stream)
+                logger.info("stream_expired", extra={"stream": stream.stream_id, "pairs": stream.judged_pairs})
 
     def _new(self, stream_id: str) -> LiveStream:
         if len(self._streams) >= self._settings.max_streams:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -238,7 +241,7 @@ def test_a_failed_load_leaves_the_old_model(
     assert str(tmp_path) not in answer.text
     assert server.client.get("/models").json() == before
     assert detect(server, "night").json()["model"]["name"] == "night"
-    assert scraped(server)["viflow_model_loads_total", ("failed",)] == 1
+    assert scraped(server)["viflow_requests_total", ("POST", "/models/{name}/load", str(status))] == 1
 
 
 def test_the_right_checksum_is_taken_and_the_metrics_follow(server: LiveServer, tmp_path: Path) -> None:
@@ -396,15 +399,17 @@ def test_real_weights_are_loaded_switched_and_refused(tmp_path: Path) -> None:
 def test_a_corrupt_model_of_the_configuration_ends_the_start(tmp_path: Path) -> None:
     bad = copied(bundled_checkpoint(), tmp_path / "bad")
     bad.write_bytes(bad.read_bytes()[:-100])
-    failures: list[Exception] = []
-    settings = load_settings(models={"night": {"checkpoint": str(bad)}}, max_concurrent=1, warm_up="")
-    from viflow_anomaly_service.server import run  # noqa: PLC0415 - imports the application
-
-    try:
-        run(settings.model_copy(update={"port": 0}))
-    except CheckpointError as err:
-        failures.append(err)
-    assert [getattr(err, "code", None) for err in failures] == ["checkpoint_corrupt"]
+    settings = {"PORT": "0", "WARM_UP": "", "MODELS__NIGHT__CHECKPOINT": str(bad)}
+    ended = subprocess.run(
+        [sys.executable, "-m", "viflow_anomaly_service"],
+        env=os.environ | {f"VIFLOW_{name}": value for name, value in settings.items()},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert ended.returncode == 2
+    assert "truncated or altered" in ended.stderr.splitlines()[-1]
 
 
 # --- settings
