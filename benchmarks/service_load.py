@@ -38,6 +38,7 @@ from viflow_anomaly.evaluation.flow_report import cpu_model
 from viflow_anomaly_service.detection_request import read_pair
 from viflow_anomaly_service.detector_loading import load_bundled_or_configured
 from viflow_anomaly_service.metrics import resident_bytes
+from viflow_anomaly_service.models.table import LoadedModel, ModelSet
 from viflow_anomaly_service.settings import load_settings
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -125,14 +126,15 @@ class Pipeline:
 
     def __init__(self, content_type: str, body: bytes) -> None:
         self._settings = load_settings()
-        self._detector = load_bundled_or_configured(self._settings)
+        model = LoadedModel("default", load_bundled_or_configured(self._settings))
+        self._models = ModelSet((model,))
         self._body = body
         self._content_type = content_type
         self._threads = len(os.sched_getaffinity(0))
 
     def once(self) -> str:
-        pair, config, _ = read_pair(self._detector, self._body, self._content_type, self._settings)
-        return to_json(self._detector.with_config(config).detect(pair))
+        pair, model, config, _ = read_pair(self._models, self._body, self._content_type, self._settings)
+        return to_json(model.detector.with_config(config).detect(pair))
 
     def latencies(self, seconds: float) -> list[float]:
         """Seconds of one pair after the other, in one thread."""

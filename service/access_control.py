@@ -28,6 +28,7 @@ from viflow_anomaly_service.rate_limits import Allowance, RateLimiter
 from viflow_anomaly_service.request_body import RequestBody
 from viflow_anomaly_service.request_log import log_fields
 from viflow_anomaly_service.settings import ServiceSettings
+from viflow_anomaly_service.socket_access import SocketAccess, may_come_later, offered_key
 
 KEY_HEADER: Final = "X-API-Key"
 CHALLENGE: Final = {"WWW-Authenticate": 'Bearer realm="viflow-anomaly"'}
@@ -48,7 +49,7 @@ def add_access_control(app: FastAPI, settings: ServiceSettings) -> None:
         app.add_middleware(
             CORSMiddleware,
             allow_origins=settings.allowed_origins,
-            allow_methods=("GET", "POST", "DELETE"),
+            allow_methods=("GET", "POST", "PUT", "DELETE"),
             allow_headers=CORS_HEADERS,
             expose_headers=EXPOSED_HEADERS,
             max_age=600,
@@ -80,23 +81,42 @@ class AccessMiddleware:
         await self.app(scope, receive, send)
 
     def _admit(self, scope: Scope) -> None:
-        headers = Headers(scope=scope)
-        method = scope.get("method", "POST")  # a WebSocket carries frames in
-        needed = required_scope(method, scope["path"])
-        client = (scope.get("client") or ("", 0))[0]
+        headers, client = Headers(scope=scope), _client_of(scope)
         if self._keys is None:
             self._require_reachable(scope, headers)
-            key = None
-        elif method in SAFE_METHODS and scope["path"] == "/metrics" and is_direct_from_here(client, headers):
+        if scope["type"] == "websocket":
+            self._admit_socket(scope, headers)
             return
-        else:
-            key = _require_key(self._keys, headers)
+        method, path = scope["method"], scope["path"]
+        is_scrape = method in SAFE_METHODS and path == "/metrics"
+        if self._keys is not None and is_scrape and is_direct_from_here(client, headers):
+            return
+        detection = required_scope(method, path) == "detect" and method == "POST"
+        self._charge(scope, _shown_key(headers), detection=detection)
+
+    def _admit_socket(self, scope: Scope, headers: Headers) -> None:
+        """A browser opens WebSockets to any site and asks nobody: the page's origin is looked at in any case."""
+        if is_foreign_page(headers, self._settings.allowed_origins):
+            raise _origin_refused()
+        shown = _shown_key(headers) or offered_key(scope.get("subprotocols", ()))
+        pending = self._keys is not None and shown is None and may_come_later(scope["path"])
+        scope["viflow_access"] = SocketAccess(
+            lambda key, detection: self._charge(scope, key, detection=detection), key=shown, pending=pending
+        )
+        if not pending:
+            self._charge(scope, shown, detection=False)
+
+    def _charge(self, scope: Scope, shown: str | None, *, detection: bool) -> None:
+        """Check the key, where keys are asked for, and count a request."""
+        key = None
+        if self._keys is not None:
+            key = _require_key(self._keys, shown)
             scope["viflow_key_name"] = log_fields(scope)["key"] = key.name
+            needed = required_scope(scope.get("method", "POST"), scope["path"])  # a WebSocket carries frames in
             if not key.may(needed):
                 detail = f"expected a key of scope {needed}, found one of {', '.join(sorted(key.scopes))}"
                 raise Problem(403, code="scope_missing", detail=detail)
-        who = _network_of(client) if key is None else f"key:{key.name}"
-        detection = needed == "detect" and method == "POST"
+        who = _network_of(_client_of(scope)) if key is None else f"key:{key.name}"
         self._limiter.charge(who, self._allowance(key), detection=detection)
 
     def _require_reachable(self, scope: Scope, headers: Headers) -> None:
@@ -108,8 +128,7 @@ class AccessMiddleware:
             detail = "The service was started without keys, and answers on this machine's loopback address only."
             raise Problem(403, code="keys_missing", detail=detail)
         if is_foreign_page(headers, self._settings.allowed_origins):
-            detail = "expected a page of this machine or an allowed origin, found another one"
-            raise Problem(403, code="origin_refused", detail=detail, field="Origin")
+            raise _origin_refused()
 
     def _allowance(self, key: ApiKey | None) -> Allowance:
         settings = self._settings
@@ -122,11 +141,24 @@ class AccessMiddleware:
         )
 
 
-def _require_key(keys: KeyRing, headers: Headers) -> ApiKey:
-    shown = headers.get(KEY_HEADER)
-    if shown is None:
-        scheme, _, credentials = headers.get("authorization", "").partition(" ")
-        shown = credentials.strip() if scheme.lower() == "bearer" else None
+def _client_of(scope: Scope) -> str:
+    client: str = (scope.get("client") or ("", 0))[0]
+    return client
+
+
+def _origin_refused() -> Problem:
+    detail = "expected a page of this machine or an allowed origin, found another one"
+    return Problem(403, code="origin_refused", detail=detail, field="Origin")
+
+
+def _shown_key(headers: Headers) -> str | None:
+    if (shown := headers.get(KEY_HEADER)) is not None:
+        return shown
+    scheme, _, credentials = headers.get("authorization", "").partition(" ")
+    return credentials.strip() if scheme.lower() == "bearer" else None
+
+
+def _require_key(keys: KeyRing, shown: str | None) -> ApiKey:
     if not shown:
         detail = f"expected an API key in 'Authorization: Bearer KEY' or '{KEY_HEADER}: KEY', found none"
         raise Problem(401, code="key_missing", detail=detail)
@@ -149,7 +181,11 @@ def _network_of(client: str) -> str:
 
 async def _refuse(problem: Problem, scope: Scope, receive: Receive, send: Send) -> None:
     if scope["type"] == "websocket":
-        await send({"type": "websocket.close", "code": 1008, "reason": problem.code})  # before it is accepted: HTTP 403
+        scope["viflow_problem_code"] = problem.code
+        if "websocket.http.response" not in scope.get("extensions", {}):
+            await send({"type": "websocket.close", "code": 1008, "reason": problem.code})  # not accepted: HTTP 403
+            return
+        await problem.response(scope.get("viflow_request_id", ""))(scope, receive, send)
         return
     body = RequestBody(Request(scope, receive))
     await body.discard()

@@ -19,14 +19,14 @@ class AdmissionGate:
 
     Attributes:
         present: requests inside.
-        closed: nobody is admitted any more.
+        closing: set once nobody is admitted any more.
     """
 
     def __init__(self, *, places: int, metrics: ServiceMetrics) -> None:
         self._places = places
         self._metrics = metrics
         self._limits: set[asyncio.Timeout] = set()
-        self.closed = False
+        self.closing = asyncio.Event()
 
     @property
     def present(self) -> int:
@@ -60,12 +60,12 @@ class AdmissionGate:
         Raises:
             Problem: 503 ``shutting_down``.
         """
-        if self.closed:
+        if self.closing.is_set():
             raise self._ending()
 
     def close(self) -> None:
         """Admit nobody any more; who is inside goes on."""
-        self.closed = True
+        self.closing.set()
 
     def expel(self) -> None:
         """Whoever is still inside is refused now: an answer, where the end of the process would be none."""

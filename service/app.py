@@ -16,9 +16,9 @@ from viflow_anomaly_service.admission import AdmissionGate
 from viflow_anomaly_service.detect_endpoint import add_detect
 from viflow_anomaly_service.detector_loading import DetectorLoader, load_bundled_or_configured, warm_up
 from viflow_anomaly_service.detector_pool import DetectorPool
-from viflow_anomaly_service.detector_slot import DetectorSlot
 from viflow_anomaly_service.metrics import ServiceMetrics
-from viflow_anomaly_service.models_endpoint import add_models
+from viflow_anomaly_service.models.endpoints import add_models
+from viflow_anomaly_service.models.table import ModelTable
 from viflow_anomaly_service.openapi import complete_openapi
 from viflow_anomaly_service.problems import install_problem_handlers
 from viflow_anomaly_service.request_log import RequestLogMiddleware
@@ -44,7 +44,7 @@ def create_app(
 
     Args:
         settings: from the environment when not given.
-        load_detector: makes the detector; called once, outside the event loop.
+        load_detector: makes the detector of a model from the settings that describe it; called outside the event loop.
         on_load_failure: told when that raised; ``/readyz`` then stays at 503.
 
     Raises:
@@ -56,7 +56,7 @@ def create_app(
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         core.pool.start()
-        background = (core.slot.fill(), _watch_memory(core.metrics), core.streams.watch())
+        background = (core.models.fill(), _watch_memory(core.metrics), core.streams.watch())
         tasks = [asyncio.create_task(one) for one in background]
         if core.keeper is not None:
             core.keeper.start()
@@ -64,6 +64,7 @@ def create_app(
         core.gate.close()
         for task in tasks:
             task.cancel()
+        await core.models.close()
         await asyncio.to_thread(core.pool.close)
         if core.keeper is not None:
             await core.keeper.close()
@@ -82,9 +83,9 @@ def create_app(
     app.add_middleware(SecurityHeadersMiddleware)
     install_problem_handlers(app)
     add_state(app, core)
-    add_models(app, core)
     add_detect(app, core)
     complete_openapi(app)
+    add_models(app, core)
     add_detections(app, core)
     add_streams(app, core)
     return app
@@ -106,8 +107,8 @@ def _build(
     return ServiceCore(
         settings=settings,
         metrics=metrics,
-        slot=DetectorSlot(
-            lambda: load_detector(settings), prepare=warm_up_everywhere, metrics=metrics, on_failure=on_load_failure
+        models=ModelTable(
+            settings, load_detector, prepare=warm_up_everywhere, metrics=metrics, on_failure=on_load_failure
         ),
         gate=gate,
         pool=pool,

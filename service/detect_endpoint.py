@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from http import HTTPStatus
 from typing import Final
 
 from fastapi import FastAPI, Request, Response
@@ -12,7 +11,7 @@ from viflow_anomaly_service.detection_work import DetectionWork
 from viflow_anomaly_service.detector_pool import DeadlinePassedError
 from viflow_anomaly_service.openapi import detect_operation
 from viflow_anomaly_service.problems import Problem
-from viflow_anomaly_service.request_body import RequestBody
+from viflow_anomaly_service.request_body import RequestBody, answered
 from viflow_anomaly_service.request_log import log_fields
 from viflow_anomaly_service.service_core import ServiceCore
 from viflow_anomaly_service.store.openapi import DETECTION_ID_HEADER
@@ -28,13 +27,8 @@ def add_detect(app: FastAPI, core: ServiceCore) -> None:
     async def detect(request: Request) -> Response:
         """Regions of independent motion in the source image of one pair, highest score first."""
         body = RequestBody(request)
-        try:
+        async with answered(body):
             answer, headers = await _answer(core, request, body)
-        except Problem as problem:
-            if problem.status != HTTPStatus.REQUEST_TIMEOUT:
-                await body.discard()
-            problem.closes_connection = not body.finished
-            raise
         return Response(answer, media_type=JSON_MEDIA_TYPE, headers=headers)
 
 
@@ -48,7 +42,7 @@ async def _answer(core: ServiceCore, request: Request, body: RequestBody) -> tup
     settings = core.settings
     core.gate.require_open()
     try:
-        detector = core.slot.require()
+        models = core.models.require()
     except Problem:
         core.metrics.shed.labels("not_ready").inc()
         raise
@@ -60,7 +54,7 @@ async def _answer(core: ServiceCore, request: Request, body: RequestBody) -> tup
         data = await body.read(max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
         uploaded_s = time.perf_counter() - started
         core.metrics.observe_stage("upload", uploaded_s)
-        work = DetectionWork(detector, data, content_type, settings=settings, metrics=core.metrics)
+        work = DetectionWork(models, data, content_type, settings=settings, metrics=core.metrics)
         del data  # the work alone holds it, and lets go of it once it is decoded
         try:
             return await body.while_connected(_judged_and_kept(core, work))

@@ -16,10 +16,10 @@ from viflow_anomaly.datasets.camera_json import camera_from_mapping
 from viflow_anomaly.errors import InvalidInputError, TooLargeError, ViflowError
 from viflow_anomaly.images import decode_image
 from viflow_anomaly.motor_input import require_supported
-from viflow_anomaly.pair_detector import PairDetector
 from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples
 from viflow_anomaly_service.form_body import parse_form
 from viflow_anomaly_service.json_body import parse_json
+from viflow_anomaly_service.models.table import LoadedModel, ModelSet
 from viflow_anomaly_service.problems import Problem, problem_of_error, problem_of_validation
 from viflow_anomaly_service.schemas import DetectRequest, ImuPart, RequestRest, StampedImuPart, WireModel
 from viflow_anomaly_service.settings import ServiceSettings
@@ -64,19 +64,19 @@ class ReceivedPair:
 
 
 def read_pair(
-    detector: PairDetector, body: bytes, content_type: str, settings: ServiceSettings
-) -> tuple[FramePair, DetectorConfig, Mapping[str, str]]:
+    models: ModelSet, body: bytes, content_type: str, settings: ServiceSettings
+) -> tuple[FramePair, LoadedModel, DetectorConfig, Mapping[str, str]]:
     """All that one request says.
 
     Args:
-        detector: whose configuration the request's options change, and whose inputs the pair must have.
+        models: of which the request chooses one, whose configuration its options change and whose inputs it must have.
         body: the whole body.
         content_type: ``multipart/form-data; boundary=...``, or anything else for JSON.
         settings: limits.
 
     Returns:
-        The pair, the configuration that it is to be judged under, and the library's field names as this kind of
-        request calls them.
+        The pair, the model, the configuration that it is to be judged under, and the library's field names as this
+        kind of request calls them.
 
     Raises:
         Problem: whatever is wrong with the request, with its code and field.
@@ -84,12 +84,14 @@ def read_pair(
     is_form = content_type.lower().startswith("multipart/")
     received = read_form(body, content_type, settings) if is_form else read_json(body, settings)
     try:
-        config = requested_config(received, detector.config)
+        options = received.rest.options
+        model = models.chosen(None if options is None else options.model, f"{received.options_place}.model")
+        config = requested_config(received, model.detector.config)
         pair = frame_pair(received, settings)
-        require_supported(pair, detector.motor_source)
+        require_supported(pair, model.detector.motor_source)
     except ViflowError as err:
         raise problem_of_error(err, received.field_names) from err
-    return pair, config, received.field_names
+    return pair, model, config, received.field_names
 
 
 def read_json(body: bytes, settings: ServiceSettings) -> ReceivedPair:

@@ -9,10 +9,10 @@ from typing import Any
 
 from viflow_anomaly.detection import Detection, to_json
 from viflow_anomaly.errors import ViflowError
-from viflow_anomaly.pair_detector import PairDetector
 from viflow_anomaly_service.detection_request import read_pair
 from viflow_anomaly_service.detector_pool import Job
 from viflow_anomaly_service.metrics import ServiceMetrics, Stage
+from viflow_anomaly_service.models.table import ModelSet
 from viflow_anomaly_service.problems import problem_of_error
 from viflow_anomaly_service.settings import ServiceSettings
 
@@ -21,7 +21,7 @@ class DetectionWork:
     """What a worker does for ``POST /detect``.
 
     Args:
-        detector: shared by all threads.
+        models: those that were there when the request came.
         body: the whole body; let go of once it is decoded.
         content_type: of the body.
         settings: limits.
@@ -34,14 +34,14 @@ class DetectionWork:
 
     def __init__(
         self,
-        detector: PairDetector,
+        models: ModelSet,
         body: bytes,
         content_type: str,
         *,
         settings: ServiceSettings,
         metrics: ServiceMetrics,
     ) -> None:
-        self._detector = detector
+        self._models = models
         self._body = body
         self._content_type = content_type
         self._settings = settings
@@ -58,16 +58,16 @@ class DetectionWork:
         """
         self._note("queue", job.waited_s)
         with self._stage("decode"):
-            pair, config, field_names = read_pair(self._detector, self._body, self._content_type, self._settings)
+            pair, model, config, field_names = read_pair(self._models, self._body, self._content_type, self._settings)
             self._body = b""
         job.require_wanted()
         with self._stage("detect"):
             try:
-                detection = self._detector.with_config(config).detect(pair, decode_ms=self.log["decode_ms"])
+                detection = model.detector.with_config(config).detect(pair, decode_ms=self.log["decode_ms"])
             except ViflowError as err:
                 raise problem_of_error(err, field_names) from err
         self.detection = detection
-        self._metrics.observe_detection(detection)
+        self._metrics.observe_detection(detection, model.name)
         self._describe(detection)
         job.require_wanted()
         with self._stage("encode"):

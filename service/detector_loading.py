@@ -21,7 +21,7 @@ DetectorLoader = Callable[[ServiceSettings], PairDetector]
 
 IMU_STEP_NS: Final = 5_000_000
 INTERVAL_NS: Final = 50_000_000
-PRELOADED: Final = ("cv2", "skimage.measure", "viflow_anomaly.alarm_calibration", "viflow_anomaly.detector")
+PRELOADED: Final = ("cv2", "skimage.measure", "viflow_anomaly.configured_detector")
 """What a detection imports and what starts no thread."""
 
 
@@ -32,23 +32,9 @@ def load_bundled_or_configured(settings: ServiceSettings) -> PairDetector:
         CheckpointError: the checkpoint cannot be used.
         ConfigError: the calibration cannot be read, or was made with something else.
     """
-    import cv2  # noqa: PLC0415 - heavy, and needed only once a server really starts
+    from viflow_anomaly.configured_detector import load_configured  # noqa: PLC0415 - heavy
 
-    from viflow_anomaly.alarm_calibration import calibrated  # noqa: PLC0415
-    from viflow_anomaly.detector import AnomalyDetector  # noqa: PLC0415
-
-    cv2.setNumThreads(settings.threads)
-    detector = AnomalyDetector.from_checkpoint(
-        settings.checkpoint,
-        config=settings.detector,
-        device=settings.device,
-        runtime=settings.runtime,
-        threads=settings.threads,
-        evidence_head=settings.evidence_head,
-        precision=settings.precision,
-        network_precision=settings.network_precision,
-    )
-    return calibrated(detector, settings.calibration)
+    return load_configured(settings)
 
 
 def preload() -> None:

@@ -133,14 +133,20 @@ class DetectorPool:
             self._withdraw(job)
 
     async def run_everywhere(self, work: Callable[[], None]) -> None:
-        """Call ``work`` once in every worker's thread, at the same time; only while nobody else is in the line."""
+        """Call ``work`` once in every worker's thread, at the same time; who is in the line waits meanwhile.
+
+        One such call at a time: two would wait for each other.
+        """
         together = threading.Barrier(len(self._threads))
 
         def meet(job: Job[None]) -> None:
             together.wait(MEET_SECONDS)
             work()
 
-        await asyncio.gather(*(self.run(meet, within_s=MEET_SECONDS) for _ in self._threads))
+        try:
+            await asyncio.gather(*(self.run(meet, within_s=MEET_SECONDS) for _ in self._threads))
+        finally:
+            together.abort()  # whoever waits for one that will not come
 
     def close(self) -> None:
         """Let the workers finish what they do, and wait for them, though not for ever."""

@@ -21,7 +21,8 @@ MULTIPROCESS_VARIABLE: Final = "PROMETHEUS_MULTIPROC_DIR"
 ShedReason = Literal["queue_full", "deadline", "shutting_down", "not_ready"]
 Stage = Literal["upload", "queue", "decode", "detect", "encode", "store"]
 SECONDS: Final = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
-_METHODS: Final = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+_METHODS: Final = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS", "MESSAGE"})
+"""``MESSAGE``: of a WebSocket."""
 _OTHER_IMU_FAULTS: Final = frozenset({"interval_too_long", "mounting_unknown", "no_accelerometer"})
 """Codes of the IMU's faults that do not say so in their name."""
 
@@ -50,7 +51,7 @@ class ServiceMetrics:
             buckets=SECONDS,
             registry=registry,
         )
-        self.detections = Counter("viflow_detections", "Judged pairs", ("status",), registry=registry)
+        self.detections = Counter("viflow_detections", "Judged pairs", ("model", "status"), registry=registry)
         self.regions = Counter("viflow_regions", "Regions in the answers", ("label",), registry=registry)
         self.reasons = Counter(
             "viflow_reasons",
@@ -79,7 +80,7 @@ class ServiceMetrics:
         self._model = Gauge(
             "viflow_model_info",
             "1; which weights answer",
-            ("name", "version", "sha256", "schema_version"),
+            ("served_as", "name", "version", "sha256", "schema_version"),
             registry=registry,
             multiprocess_mode="livemax",
         )
@@ -100,8 +101,9 @@ class ServiceMetrics:
         self.requests.labels(route, method if method in _METHODS else "other", str(status)).inc()
         self.request_seconds.labels(route).observe(seconds)
 
-    def observe_detection(self, detection: Detection) -> None:
-        self.detections.labels(detection.status).inc()
+    def observe_detection(self, detection: Detection, model: str) -> None:
+        """One judged pair; ``model``: the name that the model is served as."""
+        self.detections.labels(model, detection.status).inc()
         for roi in detection.rois:
             self.regions.labels(roi.label).inc()
         for reason in detection.reasons:
@@ -116,9 +118,12 @@ class ServiceMetrics:
         if code.startswith("imu_") or code in _OTHER_IMU_FAULTS:
             self.imu_faults.labels(code).inc()
 
-    def observe_model(self, model: ModelInfo) -> None:
-        self._model.labels(model.name, model.version, model.sha256, SCHEMA_VERSION).set(1)
-        self.ready.set(1)
+    def observe_model(self, served_as: str, model: ModelInfo) -> None:
+        self._model.labels(served_as, model.name, model.version, model.sha256, SCHEMA_VERSION).set(1)
+
+    def forget_model(self, served_as: str, model: ModelInfo) -> None:
+        """It is not loaded any more; in one process only, where its names could become many."""
+        self._model.remove(served_as, model.name, model.version, model.sha256, SCHEMA_VERSION)
 
     def observe_memory(self) -> None:
         """Called now and then: with several workers, one that is not asked must have said it before."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Coroutine
+from collections.abc import AsyncIterator, Coroutine
+from http import HTTPStatus
 from typing import Any, Final, TypeVar
 
 from starlette.requests import ClientDisconnect, Request
@@ -63,17 +64,7 @@ class RequestBody:
         Raises:
             ClientDisconnect: the client went away first.
         """
-        working, leaving = asyncio.ensure_future(work), asyncio.ensure_future(self._left())
-        try:
-            await asyncio.wait({working, leaving}, return_when=asyncio.FIRST_COMPLETED)
-            if not working.done():
-                raise ClientDisconnect
-            return working.result()
-        finally:
-            for task in (working, leaving):
-                task.cancel()
-            # Until the cancelled work has left the line: what holds its place may be given away after that only.
-            await asyncio.wait({working, leaving})
+        return await unless_gone(work, self._left())
 
     async def _left(self) -> None:
         while (await self._request.receive())["type"] != "http.disconnect":
@@ -100,6 +91,37 @@ class RequestBody:
         self.finished = not message.get("more_body", False)
         chunk: bytes = message.get("body", b"")
         return chunk
+
+
+async def unless_gone(work: Coroutine[Any, Any, Result], gone: Coroutine[Any, Any, Any]) -> Result:
+    """The result of ``work``, which is cancelled when ``gone`` ends first.
+
+    Raises:
+        ClientDisconnect: it did.
+    """
+    working, leaving = asyncio.ensure_future(work), asyncio.ensure_future(gone)
+    try:
+        await asyncio.wait({working, leaving}, return_when=asyncio.FIRST_COMPLETED)
+        if not working.done():
+            raise ClientDisconnect
+        return working.result()
+    finally:
+        for task in (working, leaving):
+            task.cancel()
+        # Until the cancelled work has left the line: what holds its place may be given away after that only.
+        await asyncio.wait({working, leaving})
+
+
+@contextlib.asynccontextmanager
+async def answered(body: RequestBody) -> AsyncIterator[None]:
+    """A refusal inside is one that the client can read: what it still sends is swallowed before."""
+    try:
+        yield
+    except Problem as problem:
+        if problem.status != HTTPStatus.REQUEST_TIMEOUT:
+            await body.discard()
+        problem.closes_connection = not body.finished
+        raise
 
 
 def _too_large(max_bytes: int, found: str) -> Problem:

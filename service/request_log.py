@@ -41,12 +41,13 @@ class RequestLogMiddleware:
         self._metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "websocket":
+            await self._socket(scope, receive, send)
+            return
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        offered = Headers(scope=scope).get(REQUEST_ID_HEADER, "")
-        request_id = offered if _ACCEPTED_ID.fullmatch(offered) else uuid.uuid4().hex
-        scope["viflow_request_id"] = request_id
+        request_id = _request_id(scope)
         started = time.perf_counter()
         status = 0
 
@@ -72,6 +73,43 @@ class RequestLogMiddleware:
         finally:
             self._log(scope, request_id, status, started)
 
+    async def _socket(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """A line when it is over, with the code that it was closed with, or the status that it was refused with."""
+        request_id, started, code = _request_id(scope), time.perf_counter(), 0
+
+        async def receive_noting() -> Message:
+            nonlocal code
+            message = await receive()
+            if message["type"] == "websocket.disconnect":
+                code = code or message.get("code") or 1005
+            return message
+
+        async def send_with_id(message: Message) -> None:
+            nonlocal code
+            if message["type"] in ("websocket.accept", "websocket.http.response.start"):
+                message.setdefault("headers", [])
+                MutableHeaders(scope=message)[REQUEST_ID_HEADER] = request_id
+            code = message.get("status" if "response" in message["type"] else "code", code)
+            await send(message)
+
+        try:
+            await self.app(scope, receive_noting, send_with_id)
+        except Exception:
+            logger.exception("unexpected_error", extra={"request_id": request_id})
+            await send({"type": "websocket.close", "code": 1011, "reason": "internal_error"})
+        finally:
+            fields = {
+                "request_id": request_id,
+                "path": scope["path"][:_MAX_LOGGED_PATH],
+                "closed_with": code,
+                "duration_ms": round((time.perf_counter() - started) * 1e3, 3),
+                "code": scope.get("viflow_problem_code"),
+                **log_fields(scope),
+            }
+            if fields["code"] is not None:
+                self._metrics.observe_problem(str(fields["code"]))
+            logger.info("websocket", extra={key: value for key, value in fields.items() if value is not None})
+
     def _log(self, scope: Scope, request_id: str, status: int, started: float) -> None:
         seconds = time.perf_counter() - started
         code = scope.get("viflow_problem_code")
@@ -89,3 +127,11 @@ class RequestLogMiddleware:
             **log_fields(scope),
         }
         logger.info("request", extra={key: value for key, value in fields.items() if value is not None})
+
+
+def _request_id(scope: Scope) -> str:
+    """The client's, where it is harmless, or a new one; noted in the scope."""
+    offered = Headers(scope=scope).get(REQUEST_ID_HEADER, "")
+    request_id = offered if _ACCEPTED_ID.fullmatch(offered) else uuid.uuid4().hex
+    scope["viflow_request_id"] = request_id
+    return request_id

@@ -90,6 +90,9 @@ class StampedImuPart(ImuPart):
 class OptionsPart(WireModel):
     """What this request wants different from the service's configuration."""
 
+    model: str | None = Field(
+        default=None, description="one of GET /models, as `name` or `name@version`; the default model when not given"
+    )
     include_masks: bool | None = None
     regions: Annotated[dict[str, Any], WithJsonSchema(RegionConfig.model_json_schema())] | None = None
 

@@ -20,6 +20,7 @@ from viflow_anomaly_service.api_keys import read_key_file
 from viflow_anomaly_service.connection_guard import guarded_protocol
 from viflow_anomaly_service.json_log import configure_logging
 from viflow_anomaly_service.settings import ServiceSettings
+from viflow_anomaly_service.socket_guard import socket_options
 from viflow_anomaly_service.stop_signals import StopSignals
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ def serve(
     config = uvicorn.Config(
         app,
         http=guarded_protocol(settings),
-        ws="none",
+        **socket_options(settings),
         lifespan="on",
         log_config=None,
         access_log=False,

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from viflow_anomaly_service.admission import AdmissionGate
 from viflow_anomaly_service.detector_pool import DetectorPool
-from viflow_anomaly_service.detector_slot import DetectorSlot
 from viflow_anomaly_service.metrics import ServiceMetrics
+from viflow_anomaly_service.models.table import ModelTable
 from viflow_anomaly_service.settings import ServiceSettings
 from viflow_anomaly_service.streams.table import StreamTable
 
@@ -23,7 +23,7 @@ class ServiceCore:
     Args:
         settings: as they were resolved.
         metrics: where everything is counted.
-        slot: the detector, once it is loaded.
+        models: the detectors, once they are loaded.
         gate: who may come in.
         pool: who does the work.
         keeper: where detections stay; None: nowhere.
@@ -32,7 +32,7 @@ class ServiceCore:
 
     settings: ServiceSettings
     metrics: ServiceMetrics
-    slot: DetectorSlot
+    models: ModelTable
     gate: AdmissionGate
     pool: DetectorPool
     keeper: ResultKeeper | None

@@ -5,9 +5,18 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, Final, Literal, NamedTuple
+from typing import Annotated, Any, Final, Literal, NamedTuple, Self
 
-from pydantic import BeforeValidator, Field, NonNegativeInt, PositiveFloat, PositiveInt, SecretStr, ValidationError
+from pydantic import (
+    BeforeValidator,
+    Field,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    SecretStr,
+    ValidationError,
+    model_validator,
+)
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict, SettingsError
 
 from viflow_anomaly.config import (
@@ -22,6 +31,7 @@ from viflow_anomaly.config import (
 )
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.settings import ENVIRONMENT_PREFIX, SERVICE_SETTINGS, refuse_unknown_variables
+from viflow_anomaly_service.models.named import ModelName, NamedModel
 
 MEBIBYTE = 1024 * 1024
 MAX_WORKERS: Final = 256
@@ -131,7 +141,21 @@ class ServiceSettings(BaseSettings):
     max_streams: PositiveInt = Field(default=64, description="streams at once")
     max_stream_bytes: PositiveInt = Field(default=256 * MEBIBYTE, description="what all streams remember together")
     stream_idle_s: PositiveFloat = Field(default=60.0, description="after which a stream is forgotten")
+    models: dict[ModelName, NamedModel] = Field(
+        default_factory=dict, description="further models by name, each what differs from the settings above"
+    )
+    model_dir: UsablePath | None = Field(default=None, description="folder whose models may be loaded by request")
+    max_models: PositiveInt = Field(default=4, description="models in memory, the default included")
+    max_websockets: PositiveInt = Field(default=32, description="open WebSockets")
+    max_websocket_bytes: PositiveInt = Field(default=4 * MEBIBYTE, description="of one message of a WebSocket")
+    websocket_idle_s: PositiveFloat = Field(default=60.0, description="after which a silent WebSocket is closed")
     log_level: Literal["debug", "info", "warning", "error"] = "info"
+
+    @model_validator(mode="after")
+    def _models_fit(self) -> Self:
+        if 1 + len(self.models) > self.max_models:
+            raise ValueError(f"max_models: expected at least {1 + len(self.models)}, found {self.max_models}")
+        return self
 
     @property
     def workers_at_once(self) -> int:
@@ -181,8 +205,16 @@ def _checked_file_values(values: Mapping[str, Any]) -> dict[str, Any]:
                 field=f"service.{name}"[:80],
             )
     _validated(values, "configuration file, [service]")
-    given = {name.upper() for name in os.environ}
-    return {name: value for name, value in values.items() if ENVIRONMENT_PREFIX + name.upper() not in given}
+    return _not_given(values, ENVIRONMENT_PREFIX, {name.upper() for name in os.environ})
+
+
+def _not_given(values: Mapping[str, Any], prefix: str, given: set[str]) -> dict[str, Any]:
+    """Those below ``prefix`` that no variable gives, tables within without the members that one gives."""
+    left = {name: value for name, value in values.items() if prefix + name.upper() not in given}
+    return {
+        name: _not_given(value, f"{prefix}{name.upper()}__", given) if isinstance(value, Mapping) else value
+        for name, value in left.items()
+    }
 
 
 def _validated(values: Mapping[str, Any], where: str) -> ServiceSettings:

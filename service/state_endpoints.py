@@ -34,7 +34,7 @@ def add_state(app: FastAPI, core: ServiceCore) -> None:
     async def readyz() -> JSONResponse:
         """The model is loaded and warm, and ``/detect`` will answer."""
         core.gate.require_open()
-        core.slot.require()
+        core.models.require()
         if core.keeper is not None:
             core.keeper.require_usable()
         return JSONResponse({"status": "ready"})
@@ -43,8 +43,8 @@ def add_state(app: FastAPI, core: ServiceCore) -> None:
     async def version() -> JSONResponse:
         """Which software and which weights answer; ``model`` is null until they are loaded."""
         model = None
-        if core.slot.detector is not None:
-            info = core.slot.detector.model_info
+        if (models := core.models.current) is not None:
+            info = models.default.detector.model_info
             model = {"name": info.name, "version": info.version, "sha256": info.sha256}
         return JSONResponse({"version": VERSION, "schema_version": SCHEMA_VERSION, "model": model})
 

@@ -12,11 +12,18 @@ from safetensors.torch import save as save_tensors
 from torch import nn
 
 from viflow_anomaly import checkpoint as checkpoint_module
-from viflow_anomaly.checkpoint import load_checkpoint, load_training_state, save_checkpoint, save_training_state
+from viflow_anomaly.checkpoint import (
+    load_checkpoint,
+    load_evidence_head,
+    load_training_state,
+    save_checkpoint,
+    save_training_state,
+)
 from viflow_anomaly.checkpoint_record import (
     MAX_RECORD_BYTES,
     CheckpointRecord,
     bundled_checkpoint,
+    bundled_evidence_head,
     source_commit,
     write_atomically,
 )
@@ -304,3 +311,14 @@ def test_what_cannot_be_written_is_told_by_its_own_name(tmp_path: Path) -> None:
         write_atomically(path, b"x")
     assert caught.value.filename == str(path)
     assert [one.name for one in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_head_in_a_networks_place_and_the_reverse_are_called_by_name() -> None:
+    for load, path, said, field in (
+        (load_checkpoint, bundled_evidence_head(), "expected a network, found an evidence head", "checkpoint"),
+        (load_evidence_head, bundled_checkpoint(), "expected an evidence head, found a network", "evidence_head"),
+    ):
+        with pytest.raises(CheckpointError) as raised:
+            load(path)
+        assert (raised.value.code, raised.value.field) == ("checkpoint_of_other_kind", field)
+        assert raised.value.message == f"{said}: {path}"

@@ -90,6 +90,11 @@ class EvidenceRecord(TensorRecord):
 
 
 Record = TypeVar("Record", bound=TensorRecord)
+_KINDS: dict[type[TensorRecord], tuple[str, str]] = {
+    CheckpointRecord: ("model", "a network"),
+    EvidenceRecord: ("head", "an evidence head"),
+}
+"""What only this kind's JSON has, and what it is called."""
 
 
 def bundled_evidence_head() -> Path:
@@ -137,7 +142,8 @@ def read_tensors(path: Path, kind: type[Record]) -> tuple[bytes, Record]:
 
     Raises:
         CheckpointError: ``checkpoint_missing``, ``checkpoint_not_safetensors`` (a pickle, or anything else),
-            ``checkpoint_record_invalid``, ``checkpoint_version``, ``checkpoint_corrupt`` (truncated or altered).
+            ``checkpoint_record_invalid``, ``checkpoint_version``, ``checkpoint_corrupt`` (truncated or altered),
+            ``checkpoint_of_other_kind`` (a head in a network's place, or the reverse).
     """
     if path.suffix != ".safetensors":
         raise CheckpointError(
@@ -189,10 +195,24 @@ def _read_record(path: Path, kind: type[Record]) -> Record:
             code="checkpoint_version",
             field="checkpoint",
         )
+    _require_kind(path, values, kind)
     try:
         return kind.from_mapping(values, where=str(record_path))
     except ConfigError as err:
         raise CheckpointError(err.message, code="checkpoint_record_invalid", field="checkpoint") from err
+
+
+def _require_kind(path: Path, values: Any, kind: type[TensorRecord]) -> None:
+    own, wanted = _KINDS[kind]
+    if not isinstance(values, dict) or own in values:
+        return
+    for only_there, found in _KINDS.values():
+        if only_there in values:
+            raise CheckpointError(
+                f"expected {wanted}, found {found}: {path}",
+                code="checkpoint_of_other_kind",
+                field="checkpoint" if kind is CheckpointRecord else "evidence_head",
+            )
 
 
 def invalid_record(record_path: Path, problem: str) -> CheckpointError:

@@ -66,9 +66,17 @@ SERVICE_SETTINGS = (
     "max_streams",
     "max_stream_bytes",
     "stream_idle_s",
+    "models",
+    "model_dir",
+    "max_models",
+    "max_websockets",
+    "max_websocket_bytes",
+    "websocket_idle_s",
     "log_level",
 )
 """What the service alone takes and checks. It is built on the library, which cannot ask it; a test compares the two."""
+SERVICE_TABLES = ("models",)
+"""Those that hold tables whose names are free: ``VIFLOW_MODELS__NIGHT__CHECKPOINT``."""
 SERVICE_TABLE = "service"
 """The table of a configuration file that holds them; the other commands pass it over."""
 TEST_SETTINGS = ("real_data",)
@@ -225,9 +233,11 @@ def refuse_unknown_variables(names: Iterable[str]) -> None:
         ConfigError: ``config_invalid`` with the closest known name.
     """
     known = {ENVIRONMENT_PREFIX + name.upper() for name in (*_variables(Settings), *SERVICE_SETTINGS, *TEST_SETTINGS)}
+    tables = tuple(f"{ENVIRONMENT_PREFIX}{name.upper()}__" for name in SERVICE_TABLES)
     for name in sorted(names):
         ours = name.startswith(ENVIRONMENT_PREFIX) and not SERVICE_LINK.fullmatch(name)
-        if ours and name.upper() not in known:
+        within = name.upper().startswith(tables)
+        if ours and not within and name.upper() not in known:
             (closest,) = difflib.get_close_matches(name.upper(), sorted(known), n=1, cutoff=0)
             raise ConfigError(
                 f"environment: expected a {ENVIRONMENT_PREFIX} variable that viflow-anomaly knows, found {name}; "

@@ -31,6 +31,7 @@ from viflow_anomaly_service.openapi_parts import (
 from viflow_anomaly_service.store.openapi import DETECTION_ID_SCHEMA, EXAMPLE_ID, STREAM_ID
 from viflow_anomaly_service.streams.schemas import StampedStreamSamples, StreamRequest, StreamSetup
 
+_TEXT: Final[JsonObject] = {"type": "string"}
 _COUNT: Final[JsonObject] = {"type": "integer", "minimum": 0}
 _NANOSECONDS_OR_NULL: Final[JsonObject] = {"anyOf": [NANOSECONDS, OR_NULL]}
 _SESSION: Final[JsonObject] = {
@@ -65,6 +66,7 @@ STATUS_SCHEMA: Final = closed_object(
         "stream_id": STREAM_ID,
         "session_id": _SESSION,
         "begun_at_ns": {**NANOSECONDS, "description": "Unix time"},
+        "model": closed_object({"name": _TEXT, "version": _TEXT}, description="that judges it"),
         "idle_s": {"type": "number", "minimum": 0},
         "received_frames": _COUNT,
         "received_imu_samples": _COUNT,
@@ -95,6 +97,7 @@ EXAMPLE_STATUS: Final[JsonObject] = {
     "stream_id": "drone7",
     "session_id": _SESSION_ID,
     "begun_at_ns": SOURCE_NS,
+    "model": {"name": "default", "version": "2"},
     "idle_s": 0.04,
     "received_frames": 2,
     "received_imu_samples": 41,

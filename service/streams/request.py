@@ -28,7 +28,7 @@ _FORM_NAMES: Final = {
     "camera": "request.camera",
     "options": "request.options",
 }
-_JSON_NAMES: Final = {"image": "frame.image_base64", "timestamp_ns": "frame.timestamp_ns"}
+JSON_NAMES: Final = {"image": "frame.image_base64", "timestamp_ns": "frame.timestamp_ns"}
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,29 @@ def read_input(body: bytes, content_type: str, settings: ServiceSettings) -> Str
     """
     is_form = content_type.lower().startswith("multipart/")
     image, stamp_ns, imu, setup = _from_form(body, content_type, settings) if is_form else _from_json(body, settings)
-    names = _FORM_NAMES if is_form else _JSON_NAMES
+    return stream_input(image, stamp_ns, imu, setup, settings=settings, names=_FORM_NAMES if is_form else JSON_NAMES)
+
+
+def stream_input(
+    image: bytes | None,
+    stamp_ns: int,
+    imu: ImuPart | None,
+    setup: StreamSetup,
+    *,
+    settings: ServiceSettings,
+    names: Mapping[str, str],
+) -> StreamInput:
+    """The parts of one call as the library's values.
+
+    Args:
+        image: a PNG or JPEG file, None: no frame.
+        stamp_ns: of the frame, where there is one.
+        imu, setup: as they were said.
+        names: the library's field names as this kind of call calls them.
+
+    Raises:
+        Problem: 413, 415 or 422.
+    """
     if image is None and imu is None:
         raise Problem(422, code="field_missing", detail="expected a frame, IMU samples, or both", field="frame")
     try:

@@ -17,12 +17,12 @@ from typing import Any, Final
 
 from prometheus_client import Counter
 
-from viflow_anomaly.stream import DetectionStream, StreamState, StreamStep
+from viflow_anomaly.stream import StreamState, StreamStep
 from viflow_anomaly_service.admission import AdmissionGate
 from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.settings import ServiceSettings
-from viflow_anomaly_service.streams.schemas import StreamSetup
+from viflow_anomaly_service.streams.work import BegunStream
 
 logger = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ class LiveStream:
     """One stream between its calls.
 
     Attributes:
-        setup, stream: None until a call has begun it.
+        begun: None until a call has begun it.
         state: after the last call that was answered.
         calls: at work or waiting for their turn.
         gone: deleted or expired; whoever still waits begins another one.
@@ -45,8 +45,7 @@ class LiveStream:
     stream_id: str
     session_id: str = field(default_factory=lambda: uuid.uuid4().hex)
     begun_at_ns: int = field(default_factory=time.time_ns)
-    setup: StreamSetup | None = None
-    stream: DetectionStream | None = None
+    begun: BegunStream | None = None
     state: StreamState = field(default_factory=StreamState)
     turn: asyncio.Lock = field(default_factory=asyncio.Lock)
     calls: int = 0
@@ -62,12 +61,15 @@ class LiveStream:
         return state_bytes(self.state)
 
     def status(self) -> dict[str, Any]:
-        """Plain JSON values."""
+        """Plain JSON values; of a stream that was begun."""
+        assert self.begun is not None  # noqa: S101 - ours
+        model = self.begun.model
         imu, frames = self.state.imu, self.state.frames
         return {
             "stream_id": self.stream_id,
             "session_id": self.session_id,
             "begun_at_ns": self.begun_at_ns,
+            "model": {"name": model.name, "version": model.version},
             "idle_s": round(time.monotonic() - self.used_at, 3),
             "received_frames": self.received_frames,
             "received_imu_samples": self.received_imu_samples,
@@ -110,7 +112,7 @@ class StreamTable:
 
     def begun(self) -> list[LiveStream]:
         """All streams, by name."""
-        return [one for _, one in sorted(self._streams.items()) if one.setup is not None]
+        return [one for _, one in sorted(self._streams.items()) if one.begun is not None]
 
     def require(self, stream_id: str) -> LiveStream:
         """A stream.
@@ -119,7 +121,7 @@ class StreamTable:
             Problem: 404 ``stream_not_found``.
         """
         found = self._streams.get(stream_id)
-        if found is None or found.setup is None:
+        if found is None or found.begun is None:
             detail = f"expected a stream that was begun and is not forgotten, found {stream_id!r:.80}"
             raise Problem(404, code="stream_not_found", detail=detail)
         return found
@@ -161,7 +163,7 @@ class StreamTable:
             finally:
                 stream.calls -= 1
                 stream.used_at = time.monotonic()
-                if stream.setup is None and not stream.calls and not stream.gone:
+                if stream.begun is None and not stream.calls and not stream.gone:
                     self.forget(stream)  # its first call failed: nothing was begun
 
     def require_room(self, stream: LiveStream, state: StreamState) -> None:
@@ -178,9 +180,9 @@ class StreamTable:
                 503, code="streams_full", detail=detail, retry_after_s=round(self._settings.stream_idle_s) + 1
             )
 
-    def advance(self, stream: LiveStream, setup: StreamSetup, judge: DetectionStream, step: StreamStep) -> None:
+    def advance(self, stream: LiveStream, begun: BegunStream, step: StreamStep) -> None:
         """What a call came to becomes what the stream remembers."""
-        stream.setup, stream.stream, stream.state = setup, judge, step.state
+        stream.begun, stream.state = begun, step.state
         stream.judged_pairs += len(step.detections)
         for fault in step.faults:
             stream.faults[fault.code] += 1
@@ -191,11 +193,15 @@ class StreamTable:
         """Forget what was idle for too long."""
         while True:
             await asyncio.sleep(min(LOOK_SECONDS, self._settings.stream_idle_s / 2))
-            now = time.monotonic()
-            for stream in list(self._streams.values()):
-                if not stream.calls and now - stream.used_at > self._settings.stream_idle_s:
-                    self.forget(stream)
-                    logger.info("stream_expired", extra={"stream": stream.stream_id, "pairs": stream.judged_pairs})
+            self._forget_idle()
+
+    def _forget_idle(self) -> None:
+        """Apart from the loop, which would keep the last stream that it looked at while it sleeps: images, model."""
+        now = time.monotonic()
+        for stream in list(self._streams.values()):
+            if not stream.calls and now - stream.used_at > self._settings.stream_idle_s:
+                self.forget(stream)
+                logger.info("stream_expired", extra={"stream": stream.stream_id, "pairs": stream.judged_pairs})
 
     def _new(self, stream_id: str) -> LiveStream:
         if len(self._streams) >= self._settings.max_streams:

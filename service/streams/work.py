@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
@@ -19,10 +19,23 @@ from viflow_anomaly.sensor_data import FramePair
 from viflow_anomaly.stream import DetectionStream, Judged, StreamConfig, StreamState, StreamStep
 from viflow_anomaly_service.detector_pool import Job
 from viflow_anomaly_service.metrics import ServiceMetrics, Stage
+from viflow_anomaly_service.models.table import LoadedModel, ModelSet
 from viflow_anomaly_service.problems import Problem, problem_of_error, problem_of_validation
 from viflow_anomaly_service.settings import ServiceSettings
-from viflow_anomaly_service.streams.request import StreamInput, read_input
+from viflow_anomaly_service.streams.request import StreamInput
 from viflow_anomaly_service.streams.schemas import StreamSetup
+
+Reading = Callable[[], StreamInput]
+"""Of what one call sent; it may take a while, and raises Problem."""
+
+
+@dataclass(frozen=True)
+class BegunStream:
+    """What the first call decides: what was said, which model judges, and the stream that asks it."""
+
+    setup: StreamSetup
+    model: LoadedModel
+    stream: DetectionStream
 
 
 @dataclass(frozen=True)
@@ -31,14 +44,13 @@ class JudgedCall:
 
     Attributes:
         received: the call itself.
-        setup, stream: of the stream from now on.
+        begun: the stream from now on.
         step: the state behind it, detections and faults.
         bodies: the detections' JSON.
     """
 
     received: StreamInput
-    setup: StreamSetup
-    stream: DetectionStream
+    begun: BegunStream
     step: StreamStep
     bodies: list[str]
 
@@ -69,10 +81,9 @@ class StreamWork:
     """What a worker does for one call.
 
     Args:
-        detector: shared by all threads.
-        body: the whole body; let go of once it is decoded.
-        content_type: of the body.
-        known: setup and stream, where an earlier call has begun it.
+        models: those that were there when the call came; one of them begins a stream.
+        read: makes the library's values of what was sent; let go of after that.
+        known: what an earlier call has begun.
         state: where the stream stands.
         settings: limits.
         metrics: told of every stage and of the detections.
@@ -83,18 +94,16 @@ class StreamWork:
 
     def __init__(
         self,
-        detector: PairDetector,
-        body: bytes,
-        content_type: str,
+        models: ModelSet,
+        read: Reading,
         *,
-        known: tuple[StreamSetup, DetectionStream] | None,
+        known: BegunStream | None,
         state: StreamState,
         settings: ServiceSettings,
         metrics: ServiceMetrics,
     ) -> None:
-        self._detector = detector
-        self._body = body
-        self._content_type = content_type
+        self._models = models
+        self._read: Reading | None = read
         self._known = known
         self._state = state
         self._settings = settings
@@ -110,32 +119,33 @@ class StreamWork:
         """
         self._note("queue", job.waited_s)
         with self._stage("decode"):
-            received = read_input(self._body, self._content_type, self._settings)
-            self._body = b""
-            setup, stream = self._stream_of(received)
+            assert self._read is not None  # noqa: S101 - called once
+            received = self._read()
+            self._read = None
+            begun = self._stream_of(received)
         job.require_wanted()
         with self._stage("detect"):
-            step = feed(stream, self._state, received)
+            step = feed(begun.stream, self._state, received)
         job.require_wanted()
         with self._stage("encode"):
             bodies = [to_json(detection) for detection in step.detections]
         for detection in step.detections:
-            self._metrics.observe_detection(detection)
+            self._metrics.observe_detection(detection, begun.model.name)
         self.log |= {"pairs": len(bodies), "faults": len(step.faults)}
-        return JudgedCall(received, setup, stream, step, bodies)
+        return JudgedCall(received, begun, step, bodies)
 
-    def _stream_of(self, received: StreamInput) -> tuple[StreamSetup, DetectionStream]:
+    def _stream_of(self, received: StreamInput) -> BegunStream:
         said = received.setup
         if self._known is None:
-            return said, new_stream(self._detector, received, self._settings)
-        setup, stream = self._known
+            return new_stream(self._models, received, self._settings)
+        setup = self._known.setup
         for name in ("camera", "options"):
             wanted, found = getattr(setup, name), getattr(said, name)
             if found is not None and found != wanted:
                 place = received.field_names.get(name, name)
                 detail = f"{place}: expected none, or the one that the stream was begun with, found another one"
                 raise Problem(409, code="stream_setup_changed", detail=detail, field=place)
-        return setup, stream
+        return self._known
 
     @contextmanager
     def _stage(self, stage: Stage) -> Iterator[None]:
@@ -150,13 +160,18 @@ class StreamWork:
         self.log[f"{stage}_ms"] = round(seconds * 1e3, 3)
 
 
-def new_stream(detector: PairDetector, received: StreamInput, settings: ServiceSettings) -> DetectionStream:
+def new_stream(models: ModelSet, received: StreamInput, settings: ServiceSettings) -> BegunStream:
     """A stream as the call that begins it wants it.
 
     Raises:
-        Problem: 422 for a camera or options that cannot be used.
+        Problem: 422 for a camera, a model or options that cannot be used; 501 ``streams_motor_unsupported``.
     """
     setup, names = received.setup, received.field_names
+    options_place = names.get("options", "options")
+    model = models.chosen(None if setup.options is None else setup.options.model, f"{options_place}.model")
+    detector = model.detector
+    if detector.motor_source is not None:
+        raise Problem(501, code="streams_motor_unsupported", detail="expected a model without motor input, found one")
     try:
         camera = None if setup.camera is None else camera_from_mapping(setup.camera, field="camera")
     except ViflowError as err:
@@ -165,11 +180,11 @@ def new_stream(detector: PairDetector, received: StreamInput, settings: ServiceS
         try:
             detector = detector.with_config(setup.options.applied_to(detector.config))
         except ValidationError as err:
-            raise problem_of_validation(err, f"{names.get('options', 'options')}.regions") from err
+            raise problem_of_validation(err, f"{options_place}.regions") from err
         except ViflowError as err:
             raise problem_of_error(err, names) from err
     config = StreamConfig(max_imu_samples=max(settings.max_imu_samples, 2))
-    return DetectionStream(StreamJudge(detector), camera=camera, config=config)
+    return BegunStream(setup, model, DetectionStream(StreamJudge(detector), camera=camera, config=config))
 
 
 def feed(stream: DetectionStream, state: StreamState, received: StreamInput) -> StreamStep:

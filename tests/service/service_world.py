@@ -19,7 +19,9 @@ import uvicorn
 from fastapi import FastAPI
 
 from viflow_anomaly_service.app import create_app
+from viflow_anomaly_service.server import GracefulServer
 from viflow_anomaly_service.settings import ServiceSettings
+from viflow_anomaly_service.socket_guard import socket_options
 
 T0 = 1_403_715_273_262_142_976
 INTERVAL_NS = 50_000_000
@@ -129,8 +131,9 @@ def live_server(
         settings: of the service.
     """
     app = create_app(ServiceSettings(**{"max_concurrent": 2, "warm_up": ()} | settings), load_detector=load_detector)
-    config = uvicorn.Config(app, port=0, http="h11", ws="none", lifespan="on", log_config=None, access_log=False)
-    server = uvicorn.Server(config)
+    sockets = socket_options(app.state.core.settings)
+    config = uvicorn.Config(app, port=0, http="h11", lifespan="on", log_config=None, access_log=False, **sockets)
+    server = GracefulServer(config, gate=app.state.core.gate, patience_s=10.0)
     thread = threading.Thread(target=server.run)
     thread.start()
     try:

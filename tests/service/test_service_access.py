@@ -355,7 +355,9 @@ def test_a_websocket_needs_a_key_before_it_is_accepted(tmp_path: Path) -> None:
             sent.append(dict(message))
 
         headers = [(b"x-api-key", key.encode())] if key else []
-        scope = {"type": "websocket", "path": "/streams/1", "headers": headers, "client": ("10.0.0.1", 1)}
+        # Without a key the first message of a stream may bring it; nowhere else.
+        asked = "/streams/1" if key else "/elsewhere"
+        scope = {"type": "websocket", "path": asked, "headers": headers, "client": ("10.0.0.1", 1)}
         await AccessMiddleware(app, ServiceSettings(key_file=path))(scope, send, send)
         return sent
 

@@ -52,7 +52,7 @@ def test_requests_stages_detections_and_faults_are_counted() -> None:
     assert rois
     for label in {roi["label"] for roi in rois}:
         assert values["viflow_regions_total", (label,)] == sum(roi["label"] == label for roi in rois)
-    assert values["viflow_detections_total", ("ok",)] == 4
+    assert values["viflow_detections_total", ("default", "ok")] == 4
     assert values["viflow_requests_total", ("POST", "/detect", "200")] == 4
     assert values["viflow_requests_total", ("POST", "/detect", "422")] == 1
     assert values["viflow_requests_total", ("GET", "none", "404")] == 1
@@ -69,7 +69,7 @@ def test_requests_stages_detections_and_faults_are_counted() -> None:
     assert values["viflow_imu_faults_total", ("imu_unsorted",)] == 1
     assert ("viflow_imu_faults_total", ("blur",)) not in values
     assert values["viflow_problems_total", ("imu_unsorted",)] == 1
-    assert values["viflow_model_info", (MODEL.name, "1.0", MODEL.sha256, MODEL.version)] == 1
+    assert values["viflow_model_info", (MODEL.name, "1.0", "default", MODEL.sha256, MODEL.version)] == 1
     assert values["viflow_ready_processes", ()] == 1
     assert values["viflow_resident_memory_bytes", ()] > 2**20
     assert values["process_open_fds", ()] > 0

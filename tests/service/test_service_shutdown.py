@@ -99,7 +99,7 @@ def test_several_processes_answer_and_their_numbers_add_up() -> None:
         for _ in range(4):
             with serving.client() as client:
                 text = client.get("/metrics").text
-            assert 'viflow_detections_total{status="ok"} 12.0' in text
+            assert 'viflow_detections_total{model="default",status="ok"} 12.0' in text
             assert "viflow_ready_processes 2.0" in text
             for pid in pids:
                 assert f'viflow_resident_memory_bytes{{pid="{pid}"}}' in text

@@ -72,7 +72,8 @@ def _with_origins(values: dict[str, Any], config: Path | None, assignments: list
     given = {name.upper() for name in os.environ}
     from_file = service_table(config)
     for name in values[SERVICE_TABLE]:
-        if ENVIRONMENT_PREFIX + name.upper() in given:
+        variable = ENVIRONMENT_PREFIX + name.upper()
+        if any(one == variable or one.startswith(f"{variable}__") for one in given):
             found[f"{SERVICE_TABLE}.{name}"] = "environment"
         elif name in from_file:
             found[f"{SERVICE_TABLE}.{name}"] = str(config)

@@ -71,27 +71,7 @@ def settings_from(
 
 
 def load_detector(settings: Settings, *, evidence: bool = True) -> AnomalyDetector:
-    """The detector that the settings describe, with its threads limited; without ``evidence`` no head is loaded.
+    """``load_configured``, whose packages are imported when it is called."""
+    from viflow_anomaly.configured_detector import load_configured
 
-    Raises:
-        CheckpointError: a checkpoint that cannot be used.
-        ConfigError: as ``alarm_calibration.calibrated``.
-    """
-    import cv2
-
-    from viflow_anomaly.alarm_calibration import calibrated
-    from viflow_anomaly.detector import AnomalyDetector
-
-    cv2.setNumThreads(settings.threads)
-    detector = AnomalyDetector.from_checkpoint(
-        settings.checkpoint,
-        config=settings.detector,
-        device=settings.device,
-        runtime=settings.runtime,
-        threads=settings.threads,
-        evidence_head=settings.evidence_head,
-        precision=settings.precision,
-        network_precision=settings.network_precision,
-        with_evidence=evidence,
-    )
-    return calibrated(detector, settings.calibration)
+    return load_configured(settings, evidence=evidence)

@@ -26,7 +26,7 @@ def body_of(status: int, headers: Mapping[str, str], body: bytes, *, url: str) -
     Raises:
         ServiceError: a child that names what the service said.
     """
-    if status == 200:
+    if status in (200, 204):
         return body
     problem = _problem(headers, body)
     if problem is not None and status >= 400:

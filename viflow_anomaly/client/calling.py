@@ -1,24 +1,26 @@
-"""The two clients: the same requests, errors and retries, one that blocks and one for asyncio."""
+"""The client that blocks, and what it shares with the one for asyncio: requests, errors, retries."""
 
 from __future__ import annotations
 
-import asyncio
 import importlib
 import re
 import time
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, Final, Self
 from urllib.parse import urlsplit
 
 from viflow_anomaly.client.answers import body_of, object_of
 from viflow_anomaly.client.api_key import require_api_key
 from viflow_anomaly.client.encoded_pair import EncodedPair
+from viflow_anomaly.client.live_events import EVENTS_PATH, Following, LiveEvent
 from viflow_anomaly.client.retry_policy import Attempts, RetryPolicy
+from viflow_anomaly.client.service_call import ServiceCall
 from viflow_anomaly.client.service_errors import ServiceError, ServiceFaultError, ServiceUnreachableError
+from viflow_anomaly.client.streaming import ClientStream, stream_options
 from viflow_anomaly.detection import Detection
 from viflow_anomaly.detection_reading import detection_from_json
 from viflow_anomaly.errors import ConfigError, InvalidInputError, MissingDependencyError
-from viflow_anomaly.sensor_data import FramePair
+from viflow_anomaly.sensor_data import FramePair, PinholeCamera
 
 if TYPE_CHECKING:
     import httpx
@@ -26,16 +28,10 @@ if TYPE_CHECKING:
 DEFAULT_TIMEOUT_S: Final = 60.0
 CONNECT_TIMEOUT_S: Final = 10.0
 _HOST: Final = re.compile(r"[A-Za-z0-9_-]([A-Za-z0-9._-]*)|[0-9a-fA-F:.]+(%[A-Za-z0-9._-]+)?", re.ASCII)
-_NO_RETRY: Final = RetryPolicy(attempts=1)
+NO_RETRY: Final = RetryPolicy(attempts=1)
 
 
-class _Call(NamedTuple):
-    method: str
-    path: str
-    files: dict[str, Any] | None = None
-
-
-class _Calling:
+class Calling:
     """What both clients share: where the service is, and what a request and its outcome mean."""
 
     def __init__(
@@ -63,9 +59,9 @@ class _Calling:
 
     def _detect_call(
         self, pair: FramePair | EncodedPair, include_masks: bool, regions: Mapping[str, Any] | None
-    ) -> _Call:
+    ) -> ServiceCall:
         encoded = EncodedPair.of(pair) if isinstance(pair, FramePair) else pair
-        return _Call("POST", "/detect", encoded.parts(include_masks=include_masks, regions=regions))
+        return ServiceCall("POST", "/detect", encoded.parts(include_masks=include_masks, regions=regions))
 
     def _body(self, response: httpx.Response) -> bytes:
         return body_of(response.status_code, response.headers, response.content, url=self._base_url)
@@ -76,6 +72,10 @@ class _Calling:
         else:
             found, code = f"{type(err).__name__}: {err}"[:300], "service_unreachable"
         return ServiceUnreachableError(f"{self._base_url}: expected an answer of the service, found {found}", code=code)
+
+    def _ended(self) -> ServiceUnreachableError:
+        detail = f"{self._base_url}: expected events without an end, found that the service ended them"
+        return ServiceUnreachableError(detail, code="service_unreachable")
 
     def _detection(self, body: bytes) -> Detection:
         try:
@@ -89,7 +89,7 @@ class _Calling:
         return object_of(body, url=self._base_url)
 
 
-class Client(_Calling):
+class Client(Calling):
     """Asks one service; keeps its connections until ``close`` or the end of a ``with`` block. Threads may share it.
 
     Args:
@@ -145,22 +145,78 @@ class Client(_Calling):
 
     def version(self) -> dict[str, Any]:
         """Of software, answer and model; raises as ``detect``."""
-        return self._object(self._ask(_Call("GET", "/version")))
+        return self._object(self._ask(ServiceCall("GET", "/version")))
 
     def models(self) -> dict[str, Any]:
         """Which weights are loaded, and what computes them; raises as ``detect``."""
-        return self._object(self._ask(_Call("GET", "/models")))
+        return self._object(self._ask(ServiceCall("GET", "/models")))
+
+    def stream(
+        self,
+        stream_id: str,
+        *,
+        camera: PinholeCamera | None = None,
+        model: str | None = None,
+        include_masks: bool = False,
+        regions: Mapping[str, Any] | None = None,
+        keep: bool = False,
+    ) -> ClientStream:
+        """A stream of frames and IMU samples, to be used in a ``with`` block; nothing is sent before its first call.
+
+        Args:
+            stream_id: 1 to 64 of ``A-Z a-z 0-9 . _ -``.
+            camera: of all frames.
+            model: one of ``models()["loaded"]``, as ``name`` or ``name@version``; None: the service's default.
+            include_masks, regions: as for ``detect``.
+            keep: leave the stream to the service when the block ends, for somebody who goes on with it.
+        """
+        options = stream_options(model, include_masks, regions)
+        return ClientStream(
+            self._ask, self._base_url, stream_id, self._policy, keep=keep, camera=camera, options=options
+        )
+
+    def follow_events(
+        self, *, after: str | None = None, filters: Mapping[str, str] | None = None
+    ) -> Iterator[LiveEvent]:
+        """Events as they happen, without an end, across broken connections: from the first on none is missed.
+
+        Args:
+            after: the id of the last event that is known; None: from now on.
+            filters: query parameters of ``GET /events/live``.
+
+        Raises:
+            ServiceError: when connections fail as often as ``RetryPolicy`` allows, one after the other.
+        """
+        following = Following(self._base_url, self._policy, after=after, filters=filters)
+        while True:
+            try:
+                with self._http.stream(
+                    "GET", EVENTS_PATH, params=following.parameters, headers=following.headers()
+                ) as response:
+                    if response.status_code != 200:
+                        response.read()
+                        self._body(response)
+                        return  # 204: no more
+                    following.require_events(response.headers)
+                    for chunk in response.iter_bytes():
+                        yield from following.events_in(chunk)
+                wait_s = following.wait_after(self._ended())
+            except self._httpx.RequestError as err:
+                wait_s = following.wait_after(self._unreachable(err))
+            except ServiceError as err:
+                wait_s = following.wait_after(err)
+            time.sleep(wait_s)
 
     def is_ready(self) -> bool:
         """Whether it would answer ``detect`` now; one attempt, and False where nothing answers."""
         try:
-            self._ask(_Call("GET", "/readyz"), _NO_RETRY)
+            self._ask(ServiceCall("GET", "/readyz"), Attempts(NO_RETRY))
         except ServiceError:
             return False
         return True
 
-    def _ask(self, call: _Call, policy: RetryPolicy | None = None) -> bytes:
-        attempts = Attempts(policy or self._policy)
+    def _ask(self, call: ServiceCall, attempts: Attempts | None = None) -> bytes:
+        attempts = attempts or Attempts(self._policy)
         while True:
             try:
                 return self._body(self._http.request(call.method, call.path, files=call.files))
@@ -169,68 +225,6 @@ class Client(_Calling):
             except ServiceError as err:
                 wait_s = attempts.wait_after(err)
             time.sleep(wait_s)
-
-
-class AsyncClient(_Calling):
-    """``Client`` for asyncio: the same arguments, methods and errors."""
-
-    def __init__(
-        self,
-        base_url: str,
-        *,
-        api_key: str | None = None,
-        timeout_s: float = DEFAULT_TIMEOUT_S,
-        retries: RetryPolicy | None = None,
-    ) -> None:
-        super().__init__(base_url, api_key=api_key, timeout_s=timeout_s, retries=retries)
-        self._http = self._httpx.AsyncClient(**self._options)
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(self, *failure: object) -> None:
-        await self.close()
-
-    async def close(self) -> None:
-        """End its connections."""
-        await self._http.aclose()
-
-    async def detect(
-        self,
-        pair: FramePair | EncodedPair,
-        *,
-        include_masks: bool = False,
-        regions: Mapping[str, Any] | None = None,
-    ) -> Detection:
-        """As ``Client.detect``."""
-        return self._detection(await self._ask(self._detect_call(pair, include_masks, regions)))
-
-    async def version(self) -> dict[str, Any]:
-        """As ``Client.version``."""
-        return self._object(await self._ask(_Call("GET", "/version")))
-
-    async def models(self) -> dict[str, Any]:
-        """As ``Client.models``."""
-        return self._object(await self._ask(_Call("GET", "/models")))
-
-    async def is_ready(self) -> bool:
-        """As ``Client.is_ready``."""
-        try:
-            await self._ask(_Call("GET", "/readyz"), _NO_RETRY)
-        except ServiceError:
-            return False
-        return True
-
-    async def _ask(self, call: _Call, policy: RetryPolicy | None = None) -> bytes:
-        attempts = Attempts(policy or self._policy)
-        while True:
-            try:
-                return self._body(await self._http.request(call.method, call.path, files=call.files))
-            except self._httpx.RequestError as err:
-                wait_s = attempts.wait_after(self._unreachable(err))
-            except ServiceError as err:
-                wait_s = attempts.wait_after(err)
-            await asyncio.sleep(wait_s)
 
 
 def _load_httpx() -> Any:

@@ -37,7 +37,7 @@ class EncodedPair:
     @classmethod
     def of(cls, pair: FramePair, *, files: tuple[bytes, bytes] | None = None) -> EncodedPair:
         """A pair of arrays, its images written as PNG, or taken from the ``files`` that they were read from."""
-        source, target = files or (_png(pair.source.image), _png(pair.target.image))
+        source, target = files or (png_file(pair.source.image), png_file(pair.target.image))
         return cls(
             source=source,
             target=target,
@@ -73,5 +73,6 @@ class EncodedPair:
         }
 
 
-def _png(image: Uint8Array) -> bytes:
+def png_file(image: Uint8Array) -> bytes:
+    """An image as it is sent."""
     return bytes(cv2.imencode(".png", image)[1])

@@ -11,13 +11,14 @@ from viflow_anomaly.client.service_errors import ServiceError, ServiceUnreachabl
 from viflow_anomaly.errors import ConfigError
 
 RETRIED_STATUSES: Final = frozenset({408, 429, 502, 503, 504})
+_BY_A_PROXY: Final = frozenset({502, 504})
 FINAL_CODES: Final = frozenset({"model_load_failed"})
 """Of answers that another try cannot change, whatever their status."""
 
 
 @dataclass(frozen=True)
 class RetryPolicy:
-    """A detection changes nothing in the service, so that asking twice does no harm.
+    """A detection changes nothing in the service, and a stream knows a frame that it has: asking twice does no harm.
 
     Args:
         attempts: at most, the first included.
@@ -46,9 +47,14 @@ class RetryPolicy:
 
 
 class Attempts:
-    """The attempts of one request."""
+    """The attempts of one request.
+
+    Attributes:
+        answer_uncertain: one of them may have been taken although no answer of the service came.
+    """
 
     def __init__(self, policy: RetryPolicy) -> None:
+        self.answer_uncertain = False
         self._policy = policy
         self._started = time.monotonic()
         self._made = 0
@@ -60,6 +66,7 @@ class Attempts:
             ServiceError: ``error`` itself: another attempt is not worth it, or none is left.
         """
         self._made += 1
+        self.answer_uncertain |= isinstance(error, ServiceUnreachableError) or error.status in _BY_A_PROXY
         policy = self._policy
         may_pass = isinstance(error, ServiceUnreachableError) or error.status in RETRIED_STATUSES
         if not may_pass or error.code in FINAL_CODES or self._made >= policy.attempts:

@@ -1,0 +1,1 @@
+"""The models of a process: several by name, one of them the default, exchanged while requests go on."""

@@ -1,0 +1,130 @@
+"""One call of a stream, however it was sent: through gate, turn, worker and store to its answer."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import Any
+
+from viflow_anomaly_service.detector_pool import DeadlinePassedError
+from viflow_anomaly_service.models.table import ModelSet
+from viflow_anomaly_service.problems import Problem
+from viflow_anomaly_service.service_core import ServiceCore
+from viflow_anomaly_service.store.query import STREAM_ID
+from viflow_anomaly_service.streams.table import LiveStream
+from viflow_anomaly_service.streams.work import JudgedCall, Reading, StreamWork
+
+
+def require_one_process(core: ServiceCore) -> None:
+    """Nothing, if all frames of a stream reach the same process.
+
+    Raises:
+        Problem: 501 ``streams_need_one_process``.
+    """
+    if core.settings.workers > 1:
+        detail = f"expected a service of one process (VIFLOW_WORKERS=1), found {core.settings.workers}: a stream's "
+        raise Problem(501, code="streams_need_one_process", detail=detail + "frames would reach different ones")
+
+
+def require_callable(core: ServiceCore, stream_id: str) -> ModelSet:
+    """The models for a call, if one can be taken at all.
+
+    Raises:
+        Problem: 422 ``stream_id_invalid``, 501, 503.
+    """
+    require_one_process(core)
+    if STREAM_ID.fullmatch(stream_id) is None:
+        detail = f"stream_id: expected 1 to 64 of A-Z a-z 0-9 . _ -, found {stream_id!r:.80}"
+        raise Problem(422, code="stream_id_invalid", detail=detail, field="stream_id")
+    core.gate.require_open()
+    try:
+        models = core.models.require()
+    except Problem:
+        core.metrics.shed.labels("not_ready").inc()
+        raise
+    if core.keeper is not None:
+        core.keeper.require_usable()  # before a pair is judged for nothing
+    return models
+
+
+async def answer_call(
+    core: ServiceCore,
+    stream_id: str,
+    models: ModelSet,
+    *,
+    receive: Callable[[], Awaitable[Reading]],
+    while_connected: Callable[[Coroutine[Any, Any, bytes]], Awaitable[bytes]],
+    log: dict[str, Any],
+) -> bytes:
+    """The answer's bytes.
+
+    Args:
+        models: as ``require_callable`` gave them.
+        receive: called once there is a place for what is sent.
+        while_connected: awaits its argument, and raises if the client goes away.
+        log: told what the call came to.
+
+    Raises:
+        Problem: the call is refused, or something is wrong with it; the stream then stays where it was.
+        ClientDisconnect: nobody waits for the answer any more.
+    """
+    settings = core.settings
+    async with core.gate.admitted(), core.streams.turn(stream_id) as stream:
+        reading = await receive()
+        work = StreamWork(
+            models,
+            reading,
+            known=stream.begun,
+            state=stream.state,
+            settings=settings,
+            metrics=core.metrics,
+        )
+        del reading  # the work alone holds what was sent, and lets go of it once it is decoded
+        try:
+            return await while_connected(_judged_and_kept(core, stream, work))
+        except DeadlinePassedError as err:
+            raise core.gate.shed("deadline", f"no turn came within {settings.queue_timeout_s:g} s") from err
+        finally:
+            log.update(work.log)
+
+
+async def _judged_and_kept(core: ServiceCore, stream: LiveStream, work: StreamWork) -> bytes:
+    """Cancelled before the call is judged, nothing has happened; after that it is finished, whoever has gone."""
+    judged = await core.pool.run(work, within_s=core.settings.queue_timeout_s)
+    finishing = asyncio.ensure_future(_kept(core, stream, judged))
+    try:
+        return await asyncio.shield(finishing)
+    except asyncio.CancelledError:
+        with contextlib.suppress(Problem):
+            await finishing
+        raise
+
+
+async def _kept(core: ServiceCore, stream: LiveStream, judged: JudgedCall) -> bytes:
+    """The stream advances once its detections are on the disk: a call that was refused can be sent again."""
+    step, received = judged.step, judged.received
+    core.streams.require_room(stream, step.state)
+    ids = None
+    if core.keeper is not None:
+        pairs = list(zip(step.detections, judged.bodies, strict=True))
+        ids = await core.keeper.keep(pairs, stream_id=stream.stream_id, session_id=stream.session_id)
+    begun = stream.begun is None
+    core.streams.advance(stream, judged.begun, step)
+    if received.frame is not None:
+        stream.received_frames += 1
+    if received.imu is not None:
+        stream.received_imu_samples += len(received.imu.timestamps_ns)
+    head = json.dumps(
+        {
+            "stream_id": stream.stream_id,
+            "session_id": stream.session_id,
+            "begun": begun,
+            "waiting_frames": max(len(step.state.frames) - 1, 0),
+            "faults": [{"code": fault.code, "message": fault.message} for fault in step.faults],
+            "detection_ids": ids,
+        },
+        separators=(",", ":"),
+    )
+    return f'{head[:-1]},"detections":[{",".join(judged.bodies)}]}}'.encode()
