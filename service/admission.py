@@ -19,14 +19,18 @@ class AdmissionGate:
 
     Attributes:
         present: requests inside.
-        closed: nobody is admitted any more.
+        closing: set when nobody is admitted any more; for those who would else go on for ever.
     """
 
     def __init__(self, *, places: int, metrics: ServiceMetrics) -> None:
         self._places = places
         self._metrics = metrics
         self._limits: set[asyncio.Timeout] = set()
-        self.closed = False
+        self.closing = asyncio.Event()
+
+    @property
+    def closed(self) -> bool:
+        return self.closing.is_set()
 
     @property
     def present(self) -> int:
@@ -65,7 +69,7 @@ class AdmissionGate:
 
     def close(self) -> None:
         """Admit nobody any more; who is inside goes on."""
-        self.closed = True
+        self.closing.set()
 
     def expel(self) -> None:
         """Whoever is still inside is refused now: an answer, where the end of the process would be none."""
