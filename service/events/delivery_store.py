@@ -142,7 +142,7 @@ class DeliveryStore:
         """How much waits for a sink."""
         mine = DELIVERIES.c.sink == sink
         counted = sa.select(DELIVERIES.c.state, sa.func.count(), sa.func.min(DELIVERIES.c.event_seq))
-        counted = counted.where(mine, DELIVERIES.c.state != "delivered").group_by(DELIVERIES.c.state)
+        counted = counted.where(mine, DELIVERIES.c.state.in_(("pending", "dead"))).group_by(DELIVERIES.c.state)
         with self._store.transaction() as connection:
             found = {state: (count, first) for state, count, first in connection.execute(counted)}
             pending, first = found.get("pending", (0, None))

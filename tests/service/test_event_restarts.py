@@ -74,9 +74,7 @@ def test_nothing_is_lost_and_nothing_comes_twice_over_kills_and_restarts(empty_s
             wait_ready(client)
             wait_until(lambda: len([one for one in everything(client) if one["kind"] == "end"]) == 12, seconds=60)
             pending = {"state": "pending"}
-            wait_until(
-                lambda: client.get("/events/deliveries", params=pending).json()["deliveries"] == [], seconds=60
-            )
+            wait_until(lambda: client.get("/events/deliveries", params=pending).json()["deliveries"] == [], seconds=60)
             events = everything(client)
             wait_until(lambda: all(heard.of(f"viflow/open{k}/motion")[-1:] == ["OFF"] for k in range(4)), seconds=30)
         wait_until(lambda: heard.retained["viflow/availability"] == "offline", seconds=30)

@@ -289,7 +289,11 @@ def test_metrics_count_events(storing: LiveServer) -> None:
             "webhook_url_invalid",
             "webhook_urls",
         ),
-        ({"webhook_urls": "http:///tok", "store_url": "x.db", "webhook_secret": "s"}, "webhook_url_invalid", "webhook_urls"),
+        (
+            {"webhook_urls": "http:///tok", "store_url": "x.db", "webhook_secret": "s"},
+            "webhook_url_invalid",
+            "webhook_urls",
+        ),
         ({"mqtt_url": "http://tok@a.example", "store_url": "x.db"}, "mqtt_url_invalid", "mqtt_url"),
         ({"mqtt_url": "mqtt://tok@a:99999", "store_url": "x.db"}, "mqtt_url_invalid", "mqtt_url"),
         ({"mqtt_url": "mqtt://tok@a/topic", "store_url": "x.db"}, "mqtt_url_invalid", "mqtt_url"),
