@@ -126,14 +126,17 @@ def test_an_unknown_delivery_is_not_found(tmp_path: Path) -> None:
 
 
 def test_deliveries_come_in_pages_of_whole_events(tmp_path: Path) -> None:
-    with webhook_receiver() as one, webhook_receiver() as other:
-        with posting(one, tmp_path, webhook_urls=f"{one.url},{other.url}") as server:
-            play(server.client, "hall", ONE_EVENT)
-            wait_until(lambda: len(one.taken()) == len(other.taken()) == 3, seconds=30)
-            page = server.client.get("/events/deliveries", params={"limit": 2}).json()
-            assert len(page["deliveries"]) == 4
-            rest = server.client.get("/events/deliveries", params={"limit": 2, "cursor": page["next_cursor"]}).json()
-            assert (len(rest["deliveries"]), rest["next_cursor"]) == (2, None)
+    with (
+        webhook_receiver() as one,
+        webhook_receiver() as other,
+        posting(one, tmp_path, webhook_urls=f"{one.url},{other.url}") as server,
+    ):
+        play(server.client, "hall", ONE_EVENT)
+        wait_until(lambda: len(one.taken()) == len(other.taken()) == 3, seconds=30)
+        page = server.client.get("/events/deliveries", params={"limit": 2}).json()
+        assert len(page["deliveries"]) == 4
+        rest = server.client.get("/events/deliveries", params={"limit": 2, "cursor": page["next_cursor"]}).json()
+        assert (len(rest["deliveries"]), rest["next_cursor"]) == (2, None)
     assert len({delivery["id"] for delivery in page["deliveries"] + rest["deliveries"]}) == 6
 
 
