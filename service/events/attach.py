@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import random
+import ssl
 import uuid
 from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass
@@ -34,7 +36,15 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 LOOK_SECONDS: Final = 1.0
+FAREWELL_SECONDS: Final = 2.0
+"""For the last events, those of the end itself, to be told before the service stops."""
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
+
+
+async def _ended(tasks: Sequence[asyncio.Task[None]]) -> None:
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
 
 
 @dataclass(frozen=True)
@@ -70,6 +80,7 @@ class EventParts:
         self._metrics = metrics
         self._keeper = keeper
         self._tasks: list[asyncio.Task[None]] = []
+        self._courier_tasks: list[asyncio.Task[None]] = []
 
     def start(self) -> None:
         """On the event loop, once the store is being opened."""
@@ -80,16 +91,19 @@ class EventParts:
             stored = self.stored
             work.append(watch_abandoned(stored.events, stored.log, self._keeper, self._metrics))
             work.append(self._look(stored.log))
-            work += [courier.run() for courier in stored.couriers]
+            self._courier_tasks = [asyncio.create_task(courier.run()) for courier in stored.couriers]
         self._tasks = [asyncio.create_task(one) for one in work]
 
     async def close(self, streams: Sequence[LiveStream]) -> None:
         """After the last request, before the store is closed."""
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await _ended(self._tasks)
         await self.desk.close(streams)
-        for courier in self.stored.couriers if self.stored is not None else ():
+        couriers = self.stored.couriers if self.stored is not None else ()
+        with contextlib.suppress(Problem, TimeoutError):  # what is left waits in the store for the next process
+            async with asyncio.timeout(FAREWELL_SECONDS):
+                await asyncio.gather(*(courier.settle() for courier in couriers))
+        await _ended(self._courier_tasks)
+        for courier in couriers:
             try:
                 await courier.release()
             except Problem as problem:
@@ -116,7 +130,7 @@ def configured_events(
 
     Raises:
         ConfigError: ``event_rules_invalid``, ``event_store_missing``, ``webhook_url_invalid``,
-            ``webhook_secret_missing``, ``mqtt_url_invalid``.
+            ``webhook_secret_missing``, ``mqtt_url_invalid``, ``mqtt_ca_invalid``.
         MissingDependencyError: ``webhook_missing``, ``mqtt_missing``.
     """
     rules, own = _rules(settings), EventMetrics(metrics)
@@ -229,14 +243,24 @@ def _mqtt(settings: ServiceSettings, deliveries: DeliveryStore, keeper: ResultKe
     broker = Broker(
         host=split.hostname or "",
         port=split.port or _PORTS[split.scheme],
-        tls=split.scheme == "mqtts",
         client_id=client_id(settings.mqtt_prefix),
         user=None if split.username is None else unquote(split.username),
         password=None if split.password is None else unquote(split.password),
-        ca_file=None if settings.mqtt_ca_file is None else str(settings.mqtt_ca_file),
+        tls=_trusting(settings) if split.scheme == "mqtts" else None,
     )
     topics = Topics(settings.mqtt_prefix, settings.mqtt_discovery_prefix, version("viflow-anomaly"))
     return [MqttSink(broker, topics, lambda: keeper.read(partial(deliveries.open_things, MQTT_NAME)))]
+
+
+def _trusting(settings: ServiceSettings) -> ssl.SSLContext:
+    try:
+        return ssl.create_default_context(cafile=settings.mqtt_ca_file)
+    except OSError as err:  # ssl's errors are OSErrors
+        raise ConfigError(
+            f"mqtt_ca_file: expected a file of certificates, found {settings.mqtt_ca_file}: {err.strerror or err}",
+            code="mqtt_ca_invalid",
+            field="mqtt_ca_file",
+        ) from err
 
 
 def _split(url: str) -> SplitResult | None:

@@ -25,6 +25,7 @@ HOLD_SECONDS: Final = 20.0
 ATTEMPT_SECONDS: Final = 10.0
 LOOK_SECONDS: Final = 2.0
 """How soon what others have changed is seen: a dead letter that is to be sent again, a sink that is free."""
+SETTLE_SECONDS: Final = 0.05
 FIRST_WAIT_SECONDS: Final = 1.0
 LONGEST_WAIT_SECONDS: Final = 300.0
 READ_AT_ONCE: Final = 100
@@ -121,6 +122,18 @@ class Courier:
             except Exception:  # a fault of ours, which must not end the courier
                 logger.exception("event_courier_failed", extra={"sink": self._sink.name})
             await asyncio.sleep(wait_s)
+
+    async def settle(self) -> None:
+        """Until nothing waits for the sink any more, or another process is the one that delivers.
+
+        Raises:
+            Problem: 503 ``store_...``.
+        """
+        while time.monotonic() < self._held_until:
+            backlog = await self._keeper.read(partial(self._deliveries.backlog, self._sink.name))
+            if not backlog.pending:
+                return
+            await asyncio.sleep(SETTLE_SECONDS)
 
     async def release(self) -> None:
         """Let another process go on at once, after ``run`` was cancelled."""

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import hashlib
 import json
+import logging
 import re
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Any, Final
 
+from viflow_anomaly_service.events.courier import DeliveryRefusedError, SinkUnreachableError
 from viflow_anomaly_service.events.event_record import EventRecord
 from viflow_anomaly_service.events.mqtt_connection import Broker, MqttConnection, mqtt_connection
+
+logger = logging.getLogger(__name__)
 
 MQTT_NAME: Final = "mqtt"
 ONLINE: Final = "online"
 OFFLINE: Final = "offline"
+FAREWELL_SECONDS: Final = 2.0
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9-]", re.ASCII)
 
 
@@ -91,8 +98,9 @@ class MqttSink:
             try:
                 yield session
             finally:
-                if not connection.broken.is_set():
-                    await connection.publish(self._topics.availability, OFFLINE, retain=True)
+                with contextlib.suppress(SinkUnreachableError, TimeoutError):
+                    async with asyncio.timeout(FAREWELL_SECONDS):
+                        await session.leave()
 
 
 class MqttSession:
@@ -103,13 +111,17 @@ class MqttSession:
         self._topics = topics
         self._open = open_things
         self._announced: set[str] = set()
+        self._refused: set[str] = set()
         self.broken = connection.broken
 
     async def announce(self) -> None:
         """Retained states once more: the broker may have lost them."""
         for stream_id in list(self._open):
             await self._show(stream_id)
-        await self._connection.publish(self._topics.availability, ONLINE, retain=True)
+        await self._state(self._topics.availability, ONLINE)
+
+    async def leave(self) -> None:
+        await self._state(self._topics.availability, OFFLINE)
 
     async def send(self, event: EventRecord) -> None:
         stream_id = event.stream_id
@@ -125,10 +137,18 @@ class MqttSession:
     async def _show(self, stream_id: str) -> None:
         if stream_id not in self._announced:
             topic, config = self._topics.sensor(stream_id)
-            await self._connection.publish(topic, json.dumps(config), retain=True)
+            await self._state(topic, json.dumps(config))
             self._announced.add(stream_id)
-        state = "ON" if self._open[stream_id] else "OFF"
-        await self._connection.publish(self._topics.motion(stream_id), state, retain=True)
+        await self._state(self._topics.motion(stream_id), "ON" if self._open[stream_id] else "OFF")
+
+    async def _state(self, topic: str, payload: str) -> None:
+        """Retained; a broker that refuses it (not every one lets us tell Home Assistant) still gets the events."""
+        try:
+            await self._connection.publish(topic, payload, retain=True)
+        except DeliveryRefusedError as err:
+            if topic not in self._refused:
+                logger.warning("mqtt_state_refused", extra={"topic": topic, "cause": str(err)})
+            self._refused.add(topic)
 
 
 def client_id(prefix: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ssl
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -26,11 +27,10 @@ class Broker:
 
     host: str
     port: int
-    tls: bool
     client_id: str
     user: str | None = None
     password: str | None = None
-    ca_file: str | None = None
+    tls: ssl.SSLContext | None = None
 
 
 class MqttConnection:
@@ -54,8 +54,8 @@ class MqttConnection:
         )
         client.connect_timeout = ATTEMPT_SECONDS / 2
         client.username_pw_set(broker.user, broker.password)
-        if broker.tls:
-            client.tls_set(ca_certs=broker.ca_file)
+        if broker.tls is not None:
+            client.tls_set_context(broker.tls)
         client.will_set(*will, qos=1, retain=True)
         client.on_connect = self._on_connect
         client.on_disconnect = self._on_disconnect
@@ -88,7 +88,7 @@ class MqttConnection:
         if self.broken.is_set():
             raise SinkUnreachableError("the connection ended")
         sent: MQTTMessageInfo = self._client.publish(topic, payload, qos=1, retain=retain)
-        acknowledged = self._waiting.setdefault(sent.mid, self._loop.create_future())
+        acknowledged = self._waiting[sent.mid] = self._loop.create_future()  # before any callback has its turn
         try:
             async with asyncio.timeout(ATTEMPT_SECONDS):
                 await acknowledged
@@ -120,8 +120,8 @@ class MqttConnection:
             self._connected.set_result(None)
 
     def _acknowledge(self, mid: int, reason: ReasonCode) -> None:
-        future = self._waiting.setdefault(mid, self._loop.create_future())
-        if future.done():
+        future = self._waiting.get(mid)
+        if future is None or future.done():  # nobody waits for it any more
             return
         if reason.value < _FAILURE:
             future.set_result(None)
@@ -133,7 +133,8 @@ class MqttConnection:
         for future in (self._connected, *self._waiting.values()):
             if not future.done():
                 future.set_exception(SinkUnreachableError(cause))
-        self._connected.exception()  # whoever waited for it has been told; nobody else will ask
+        if not self._connected.cancelled():
+            self._connected.exception()  # whoever waited for it has been told; nobody else will ask
 
     def _call(self, action: Callable[..., object], *values: Any) -> None:
         with contextlib.suppress(RuntimeError):  # the loop has been closed: nobody waits

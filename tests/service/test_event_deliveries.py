@@ -17,7 +17,7 @@ from mosquitto_server import MosquittoServer, listening, mosquitto_server
 from scripted_detector import ScriptedDetector
 from service_world import LiveServer, assert_problem, live_server, wait_until
 from test_events import KINDS, ONE_EVENT, QUICK
-from webhook_receiver import WebhookReceiver, webhook_receiver
+from webhook_receiver import WebhookReceiver, endless_receiver, webhook_receiver
 
 from viflow_anomaly_service.events import courier, webhook
 from viflow_anomaly_service.events.mqtt import Topics
@@ -235,7 +235,7 @@ def test_a_broker_that_forgot_everything_is_told_again(broker: MosquittoServer, 
 
 @pytest.mark.usefixtures("impatient")
 def test_what_the_broker_refuses_is_not_delivered(tmp_path: Path) -> None:
-    acl = "topic write viflow/availability\ntopic write viflow/+/motion\ntopic write homeassistant/#\ntopic read #\n"
+    acl = "topic write viflow/availability\ntopic write viflow/+/motion\ntopic read #\n"
     store = str(tmp_path / "events.db")
     with (
         mosquitto_server(acl=acl) as broker,
@@ -253,6 +253,16 @@ def test_what_the_broker_refuses_is_not_delivered(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("impatient")
+def test_home_assistant_may_be_refused(tmp_path: Path) -> None:
+    store = str(tmp_path / "events.db")
+    with mosquitto_server(acl="topic write viflow/+/events\ntopic read #\n") as broker:
+        address = {"store_url": store, "mqtt_url": f"mqtt://127.0.0.1:{broker.port}"}
+        with live_server(lambda settings: ScriptedDetector(), **QUICK, **address) as server:
+            play(server.client, "hall", ONE_EVENT)
+            wait_until(lambda: len(deliveries(server, state="delivered")) == 3, seconds=30)
+
+
+@pytest.mark.usefixtures("impatient")
 def test_a_broker_that_is_not_there_costs_no_attempt(tmp_path: Path) -> None:
     store = str(tmp_path / "events.db")
     address = {"store_url": store, "mqtt_url": "mqtt://127.0.0.1:1"}
@@ -261,3 +271,30 @@ def test_a_broker_that_is_not_there_costs_no_attempt(tmp_path: Path) -> None:
         text = 'viflow_event_deliveries_total{result="unreachable",sink="mqtt"}'
         wait_until(lambda: text in server.client.get("/metrics").text, seconds=30)
         assert [(one["state"], one["attempts"]) for one in deliveries(server)] == [("pending", 0)] * 3
+
+
+def test_a_service_that_stops_tells_of_the_end(broker: MosquittoServer, tmp_path: Path) -> None:
+    with webhook_receiver() as receiver, listening(broker) as heard:
+        with posting(receiver, tmp_path, mqtt_url=broker.url) as server:
+            play(server.client, "hall", ONE_EVENT[:4])
+            wait_until(lambda: len(receiver.taken()) == 1 and heard.of("viflow/hall/motion")[-1:] == ["ON"], seconds=30)
+        assert [one["reason"] for one in receiver.taken()] == [None, "service_stopped"]
+        wait_until(lambda: heard.retained["viflow/availability"] == "offline")
+        assert heard.of("viflow/hall/motion")[-2:] == ["ON", "OFF"]
+
+
+@pytest.mark.usefixtures("impatient")
+def test_a_long_answer_is_not_read_to_its_end(tmp_path: Path) -> None:
+    """A receiver that answers without end has taken the event all the same."""
+    with (
+        endless_receiver() as address,
+        live_server(
+            lambda settings: ScriptedDetector(),
+            **QUICK,
+            store_url=str(tmp_path / "events.db"),
+            webhook_urls=address,
+            webhook_secret=SECRET,
+        ) as server,
+    ):
+        play(server.client, "hall", ONE_EVENT)
+        wait_until(lambda: len(deliveries(server, state="delivered")) == 3, seconds=30)

@@ -299,6 +299,11 @@ def test_metrics_count_events(storing: LiveServer) -> None:
         ({"mqtt_url": "mqtt://tok@a/topic", "store_url": "x.db"}, "mqtt_url_invalid", "mqtt_url"),
         ({"mqtt_url": "mqtt://tok@a?x=1", "store_url": "x.db"}, "mqtt_url_invalid", "mqtt_url"),
         ({"mqtt_url": "tok", "store_url": "x.db"}, "mqtt_url_invalid", "mqtt_url"),
+        (
+            {"mqtt_url": "mqtts://a", "mqtt_ca_file": "/nowhere/ca.pem", "store_url": "x.db"},
+            "mqtt_ca_invalid",
+            "mqtt_ca_file",
+        ),
         ({"event_start_score": 0.2, "event_end_score": 0.3}, "event_rules_invalid", "event_end_score"),
     ],
 )

@@ -81,3 +81,31 @@ def webhook_receiver(status_of: Callable[[dict[str, Any]], int] = lambda event: 
         yield receiver
     finally:
         receiver.stop()
+
+
+@contextlib.contextmanager
+def endless_receiver() -> Iterator[str]:
+    """The URL of somebody who says 200 and then goes on talking."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            self.rfile.read(int(self.headers["Content-Length"]))
+            self.send_response(200)
+            self.end_headers()
+            with contextlib.suppress(OSError):
+                while True:
+                    self.wfile.write(b"." * 65536)
+
+        def log_message(self, format: str, *values: Any) -> None:  # noqa: A002 - its name in the parent
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    server.daemon_threads = True
+    thread = threading.Thread(target=server.serve_forever, args=(0.05,))
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_address[1]}/"
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join(20)
