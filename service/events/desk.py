@@ -79,7 +79,7 @@ class EventDesk:
         self._log = log
         self._metrics = metrics
         self._new_id = IdMaker()
-        self._ends: deque[list[EventRecord]] = deque()
+        self._ends: deque[tuple[Noticed, EndReason]] = deque()
         self._some_end = asyncio.Event()
 
     @property
@@ -111,11 +111,12 @@ class EventDesk:
         """A stream is no more: what is open in it ends, as soon as that can be kept."""
         told = [(0, event) for event in end_all(stream.events, reason)]
         stream.events = EventState()
-        if told:
-            ending = Noticed(stream, stream.events, told, 0, self._log, self._new_id)
-            ending.name(None)
-            self._ends.append(ending.records)
-            self._some_end.set()
+        if stream.setup is None:
+            return  # nothing was begun
+        ending = Noticed(stream, stream.events, told, 0, self._log, self._new_id)
+        ending.name(None)
+        self._ends.append((ending, reason))
+        self._some_end.set()
 
     async def watch(self) -> None:
         """Keep the ends of streams that were forgotten, however often that takes."""
@@ -144,5 +145,7 @@ class EventDesk:
             logger.warning("event_ends_left", extra={"streams": len(self._ends)})
 
     async def _keep_end(self) -> None:
-        await self._log.add(self._ends[0])
-        self._metrics.count(self._ends.popleft())
+        ending, reason = self._ends[0]
+        await self._log.end(ending.stream.session_id, reason, ending.records)
+        self._metrics.count(ending.records)
+        self._ends.popleft()

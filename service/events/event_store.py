@@ -11,6 +11,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import Connection
 
 from viflow_anomaly_service.events.event_record import EventRecord, ended
+from viflow_anomaly_service.events.event_rules import EndReason
 from viflow_anomaly_service.events.log import LoggedEvent
 from viflow_anomaly_service.events.query import EventFilter
 from viflow_anomaly_service.store.detection_store import DetectionStore
@@ -102,6 +103,17 @@ class EventStore:
         with self._store.transaction(writes=True) as connection:
             connection.execute(held.values(held_until_ns=time.time_ns() + self._hold_ns))
 
+    def is_open(self, session_id: str) -> bool:
+        """Whether something is open of a session of a stream."""
+        return self._some_open(_of_session(session_id))
+
+    def end_session(self, session_id: str, reason: EndReason, ends: Sequence[EventRecord]) -> None:
+        """Keep these ends, and end what else is open: its start was committed, though nobody came to know of it."""
+        with self._store.transaction(writes=True) as connection:
+            self.insert(connection, ends)
+            left = connection.execute(sa.select(OPEN_EVENTS.c.body).where(_of_session(session_id))).scalars().all()
+            self.insert(connection, [ended(body, event_id=self._new_id(), reason=reason) for body in left])
+
     def holds_some(self) -> bool:
         """Whether something is open that this process has begun."""
         return self._some_open(OPEN_EVENTS.c.holder == self._holder)
@@ -152,6 +164,10 @@ class EventStore:
         waiting = {"event_seq": seq, "state": "pending", "attempts": 0, "next_attempt_ns": now_ns}
         if self._sinks:
             connection.execute(sa.insert(DELIVERIES), [{**waiting, "sink": sink} for sink in self._sinks])
+
+
+def _of_session(session_id: str) -> sa.ColumnElement[bool]:
+    return OPEN_EVENTS.c.thing_id.startswith(f"{session_id}-", autoescape=True)
 
 
 def _insertion(connection: Connection) -> Any:

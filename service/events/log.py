@@ -9,6 +9,7 @@ from itertools import count, islice
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from viflow_anomaly_service.events.event_record import EventRecord
+from viflow_anomaly_service.events.event_rules import EndReason
 
 if TYPE_CHECKING:
     from sqlalchemy.engine import Connection
@@ -50,8 +51,8 @@ class EventLog(Protocol):
     def took(self, events: Sequence[EventRecord]) -> None:
         """The detections are kept, and with them what ``part_of_commit`` keeps."""
 
-    async def add(self, events: Sequence[EventRecord]) -> None:
-        """Keep events that come with no detection.
+    async def end(self, session_id: str, reason: EndReason, ends: Sequence[EventRecord]) -> None:
+        """Keep the ends of a session of a stream, and end what else is open in it.
 
         Raises:
             Problem: 503 ``store_...``.
@@ -113,5 +114,5 @@ class MemoryLog:
             self._kept.append(LoggedEvent(next(self._numbers), event))
         self._bell.ring()
 
-    async def add(self, events: Sequence[EventRecord]) -> None:
-        self.took(events)
+    async def end(self, session_id: str, reason: EndReason, ends: Sequence[EventRecord]) -> None:
+        self.took(ends)

@@ -10,6 +10,7 @@ from typing import Final
 from sqlalchemy.engine import Connection
 
 from viflow_anomaly_service.events.event_record import EventRecord
+from viflow_anomaly_service.events.event_rules import EndReason
 from viflow_anomaly_service.events.event_store import EventStore
 from viflow_anomaly_service.events.log import Bell, LoggedEvent, Place
 from viflow_anomaly_service.store.keeper import ResultKeeper
@@ -52,9 +53,11 @@ class StoreLog:
         if events:
             self._bell.ring()
 
-    async def add(self, events: Sequence[EventRecord]) -> None:
-        await self._keeper.change(partial(self._events.add, events))
-        self._bell.ring()
+    async def end(self, session_id: str, reason: EndReason, ends: Sequence[EventRecord]) -> None:
+        is_open: bool = await self._keeper.read(partial(self._events.is_open, session_id))
+        if ends or is_open:
+            await self._keeper.change(partial(self._events.end_session, session_id, reason, ends))
+            self._bell.ring()
 
     async def look(self) -> None:
         """Wake those who wait, if another process has kept events."""

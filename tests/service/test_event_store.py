@@ -256,7 +256,7 @@ def test_a_reader_that_falls_behind_the_ring_is_told_of_the_gap() -> None:
 def test_the_ring_ends_what_has_begun_once() -> None:
     async def tell() -> list[str]:
         log = MemoryLog(9)
-        await log.add([event("start"), event("end", at=1), event("end", at=2), event("update", at=3)])
+        log.took([event("start"), event("end", at=1), event("end", at=2), event("update", at=3)])
         found = await log.after(0, 9)
         assert found is not None
         return [one.event.kind for one in found]

@@ -10,7 +10,7 @@ from typing import Any
 import jsonschema
 import pytest
 from event_stream import play, reading
-from scripted_detector import ScriptedDetector
+from scripted_detector import ScriptedDetector, scripted_call
 from service_world import LiveServer, assert_problem, live_server, wait_until
 from serving_process import serving_process
 
@@ -167,10 +167,8 @@ def test_a_service_that_stops_ends_what_is_open(tmp_path: Path) -> None:
         ]
 
 
-def test_a_call_that_is_sent_again_makes_no_event_twice(storing: LiveServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The commit worked, but nobody was told: the client gets 503 and sends the frame again."""
-    play(storing.client, "hall", ONE_EVENT[:2])
-    store = storing.app.state.core.keeper.store
+def fail_once_behind_the_commit(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = server.app.state.core.keeper.store
     add: Callable[..., None] = store.add
 
     def add_and_fail(*given: Any) -> None:
@@ -179,13 +177,27 @@ def test_a_call_that_is_sent_again_makes_no_event_twice(storing: LiveServer, mon
         raise store_error("store_unavailable")
 
     monkeypatch.setattr(store, "add", add_and_fail)
-    from scripted_detector import scripted_call  # noqa: PLC0415
 
+
+def test_a_call_that_is_sent_again_makes_no_event_twice(storing: LiveServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The commit worked, but nobody was told: the client gets 503 and sends the frame again."""
+    play(storing.client, "hall", ONE_EVENT[:2])
+    fail_once_behind_the_commit(storing, monkeypatch)
     call = scripted_call(2, 0.9)
     assert storing.client.post("/streams/hall/frames", json=call).status_code == 503
     wait_until(lambda: storing.client.post("/streams/hall/frames", json=call).status_code == 200)
     play(storing.client, "hall", ONE_EVENT[3:], first=3)
     assert [one["kind"] for one in listed(storing, order="asc")["events"]] == KINDS
+
+
+def test_a_start_that_nobody_came_to_know_of_is_ended_too(storing: LiveServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The commit worked, nobody was told, and the client gave up."""
+    play(storing.client, "hall", ONE_EVENT[:2])
+    fail_once_behind_the_commit(storing, monkeypatch)
+    assert storing.client.post("/streams/hall/frames", json=scripted_call(2, 0.9)).status_code == 503
+    assert storing.client.delete("/streams/hall").status_code == 204
+    wait_until(lambda: [one["kind"] for one in listed(storing)["events"]] == ["end", "start"])
+    assert listed(storing)["events"][0]["reason"] == "stream_deleted"
 
 
 def test_pages_filters_and_export_give_everything_once(storing: LiveServer, monkeypatch: pytest.MonkeyPatch) -> None:
