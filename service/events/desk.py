@@ -129,7 +129,7 @@ class EventDesk:
                 except Problem as problem:
                     logger.warning("event_ends_wait", extra={"code": problem.code})
                     await asyncio.sleep(RETRY_SECONDS)
-                except Exception:  # a fault of ours: these are ended as those of a process that is no more
+                except Exception:  # a fault of ours: the next process ends these, once this one is no more
                     logger.exception("event_ends_failed")
                     self._ends.popleft()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator
 from typing import Final
 
 from viflow_anomaly_service.events.event_record import EventRecord
@@ -40,7 +40,7 @@ class LiveReaders:
         self.present = 0
 
     async def begin(self, last_event_id: str | None) -> Place:
-        """Where a reader begins.
+        """Where a reader begins, who holds a place until ``leave``.
 
         Raises:
             Problem: 503 ``shutting_down``, ``event_readers_full``, ``store_...``.
@@ -50,24 +50,29 @@ class LiveReaders:
         if self.present >= self._limit:
             detail = f"expected at most {self._limit} readers of events at once, found one more"
             raise Problem(503, code="event_readers_full", detail=detail, retry_after_s=5)
-        if last_event_id is None:
-            return Place(await self._log.newest(), gap=False)
-        return await self._log.place_of(last_event_id)
-
-    async def read(self, place: Place, stream_id: str | None) -> AsyncIterator[bytes]:
-        """The stream's bytes from a place on, until the service stops or the log fails."""
         self.present += 1
         self._metrics.readers.inc()
         try:
-            yield f"retry: {RECONNECT_MS}\n\n".encode()
-            if place.gap:
-                yield _gap()
-            with contextlib.suppress(Problem):  # the store fails: the reader comes back and is told why
-                async for part in self._parts(place.seq, stream_id):
-                    yield part
-        finally:
-            self.present -= 1
-            self._metrics.readers.dec()
+            if last_event_id is None:
+                return Place(await self._log.newest(), gap=False)
+            return await self._log.place_of(last_event_id)
+        except BaseException:
+            self.leave()
+            raise
+
+    def leave(self) -> None:
+        """A reader that has begun is gone."""
+        self.present -= 1
+        self._metrics.readers.dec()
+
+    async def read(self, place: Place, stream_id: str | None) -> AsyncGenerator[bytes, None]:
+        """The stream's bytes from a place on, until the service stops or the log fails."""
+        yield f"retry: {RECONNECT_MS}\n\n".encode()
+        if place.gap:
+            yield _gap()
+        with contextlib.suppress(Problem):  # the store fails: the reader comes back and is told why
+            async for part in self._parts(place.seq, stream_id):
+                yield part
 
     async def _parts(self, seq: int, stream_id: str | None) -> AsyncIterator[bytes]:
         while not self._closing.is_set():

@@ -112,7 +112,8 @@ class MemoryLog:
                 continue  # it has ended: its stream was forgotten while a call was at work
             (self._open.discard if event.kind == "end" else self._open.add)(event.thing_id)
             self._kept.append(LoggedEvent(next(self._numbers), event))
-        self._bell.ring()
+        if events:
+            self._bell.ring()
 
     async def end(self, session_id: str, reason: EndReason, ends: Sequence[EventRecord]) -> None:
         self.took(ends)

@@ -240,7 +240,7 @@ def test_a_reader_that_falls_behind_the_ring_is_told_of_the_gap() -> None:
         found.append(await anext(parts))
         log.took([event("start", f"t-{number}") for number in range(2, 6)])
         found += [await anext(parts), await anext(parts)]
-        await parts.aclose()  # type: ignore[attr-defined]
+        await parts.aclose()
         return found
 
     retry, first, gap, rest = asyncio.run(read())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,10 @@ from serving_process import serving_process
 from viflow_anomaly.errors import ConfigError, MissingDependencyError
 from viflow_anomaly_service.app import create_app
 from viflow_anomaly_service.events import live
+from viflow_anomaly_service.events.event_record import EventRecord
 from viflow_anomaly_service.settings import ServiceSettings
 from viflow_anomaly_service.store.failures import store_error
+from viflow_anomaly_service.store.record import IdMaker
 
 QUICK: dict[str, Any] = {
     "event_start_pairs": 2,
@@ -133,6 +136,22 @@ def test_readers_are_bounded(tmp_path: Path) -> None:
         wait_until(lambda: server.app.state.core.events.readers.present == 0)
         with reading(url(server)):
             pass
+
+
+def test_a_reader_that_takes_nothing_is_closed(tmp_path: Path) -> None:
+    store = str(tmp_path / "events.db")
+    with live_server(lambda settings: ScriptedDetector(), store_url=store, request_timeout_s=0.5) as server:
+        new_id, text = IdMaker(), json.dumps({"padding": "." * 20_000})
+        many = [EventRecord(new_id(), f"t-{k}", "start", "hall", k, text) for k in range(1000)]
+        server.app.state.core.events.stored.events.add(many)
+        readers = server.app.state.core.events.readers
+        with socket.socket() as slow:
+            slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            slow.connect(("127.0.0.1", server.port))
+            head = f"GET /events/live HTTP/1.1\r\nHost: 127.0.0.1\r\nLast-Event-ID: {'0' * 32}\r\n\r\n"
+            slow.sendall(head.encode())
+            wait_until(lambda: readers.present == 1)
+            wait_until(lambda: readers.present == 0, seconds=30)
 
 
 def test_readers_end_at_once_when_the_service_stops() -> None:
