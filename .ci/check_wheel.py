@@ -12,6 +12,8 @@ REQUIRED = (
     "viflow_anomaly/cli/main.py",
     "viflow_anomaly_service/server.py",
     "viflow_anomaly_service/store/migrations/versions/v0001_detections.py",
+    "viflow_anomaly_service/store/migrations/versions/v0002_events.py",
+    "viflow_anomaly_service/events/attach.py",
 )
 MAX_WEIGHTS_BYTES = 8 * 1024 * 1024
 

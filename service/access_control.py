@@ -32,7 +32,7 @@ from viflow_anomaly_service.socket_access import SocketAccess, may_come_later, o
 
 KEY_HEADER: Final = "X-API-Key"
 CHALLENGE: Final = {"WWW-Authenticate": 'Bearer realm="viflow-anomaly"'}
-CORS_HEADERS: Final = ("Authorization", KEY_HEADER, "Content-Type", "X-Request-ID")
+CORS_HEADERS: Final = ("Authorization", KEY_HEADER, "Content-Type", "X-Request-ID", "Last-Event-ID")
 EXPOSED_HEADERS: Final = ("X-Request-ID", "Retry-After")
 _EVENT_STREAM: Final = "text/event-stream"
 

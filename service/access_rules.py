@@ -35,6 +35,7 @@ _RULES: Final = (
     _Rule(_READING, "/docs", None),
     _Rule(None, "/streams", "detect"),
     _Rule(_POSTING, "/detect", "detect"),
+    _Rule(None, "/events/deliveries", "admin"),
     _Rule(_READING, "/", "read"),
 )
 

@@ -19,7 +19,7 @@ class AdmissionGate:
 
     Attributes:
         present: requests inside.
-        closing: set once nobody is admitted any more.
+        closing: set when nobody is admitted any more; for those who would else go on for ever.
     """
 
     def __init__(self, *, places: int, metrics: ServiceMetrics) -> None:
@@ -27,6 +27,10 @@ class AdmissionGate:
         self._metrics = metrics
         self._limits: set[asyncio.Timeout] = set()
         self.closing = asyncio.Event()
+
+    @property
+    def closed(self) -> bool:
+        return self.closing.is_set()
 
     @property
     def present(self) -> int:

@@ -16,6 +16,8 @@ from viflow_anomaly_service.admission import AdmissionGate
 from viflow_anomaly_service.detect_endpoint import add_detect
 from viflow_anomaly_service.detector_loading import DetectorLoader, load_bundled_or_configured, warm_up
 from viflow_anomaly_service.detector_pool import DetectorPool
+from viflow_anomaly_service.events.attach import configured_events
+from viflow_anomaly_service.events.endpoints import add_events
 from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.models.endpoints import add_models
 from viflow_anomaly_service.models.table import ModelTable
@@ -49,7 +51,8 @@ def create_app(
 
     Raises:
         ConfigError: ``config_invalid``, an environment variable that cannot be used; ``store_url_invalid``.
-        MissingDependencyError: ``store_missing``.
+            An event's rule, sink or secret that cannot be used: see ``configured_events``.
+        MissingDependencyError: ``store_missing``, ``webhook_missing``, ``mqtt_missing``.
     """
     core = _build(settings or load_settings(), load_detector, on_load_failure)
 
@@ -60,12 +63,14 @@ def create_app(
         tasks = [asyncio.create_task(one) for one in background]
         if core.keeper is not None:
             core.keeper.start()
+        core.events.start()
         yield
         core.gate.close()
         for task in tasks:
             task.cancel()
         await core.models.close()
         await asyncio.to_thread(core.pool.close)
+        await core.events.close(core.streams.begun())
         if core.keeper is not None:
             await core.keeper.close()
 
@@ -88,6 +93,7 @@ def create_app(
     add_models(app, core)
     add_detections(app, core)
     add_streams(app, core)
+    add_events(app, core)
     return app
 
 
@@ -104,6 +110,8 @@ def _build(
         for camera in settings.warm_up:
             await pool.run_everywhere(partial(warm_up, detector, camera))
 
+    keeper = configured_keeper(settings, metrics)
+    events = configured_events(settings, metrics, keeper, gate.closing)
     return ServiceCore(
         settings=settings,
         metrics=metrics,
@@ -112,8 +120,9 @@ def _build(
         ),
         gate=gate,
         pool=pool,
-        keeper=configured_keeper(settings, metrics),
-        streams=StreamTable(settings, gate, metrics),
+        keeper=keeper,
+        streams=StreamTable(settings, gate, metrics, on_forget=events.desk.end),
+        events=events,
     )
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from viflow_anomaly_service.admission import AdmissionGate
 from viflow_anomaly_service.detector_pool import DetectorPool
+from viflow_anomaly_service.events.attach import EventParts
 from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.models.table import ModelTable
 from viflow_anomaly_service.settings import ServiceSettings
@@ -28,6 +29,7 @@ class ServiceCore:
         pool: who does the work.
         keeper: where detections stay; None: nowhere.
         streams: what is remembered between frames.
+        events: what is told of what moves.
     """
 
     settings: ServiceSettings
@@ -37,3 +39,4 @@ class ServiceCore:
     pool: DetectorPool
     keeper: ResultKeeper | None
     streams: StreamTable
+    events: EventParts

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, Self
 from pydantic import (
     BeforeValidator,
     Field,
+    NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
     PositiveInt,
@@ -81,7 +82,15 @@ def _origins(value: Any) -> Any:
     return tuple(found)
 
 
+def _texts(value: Any) -> Any:
+    """``"a,b"`` as texts; anything else as it is."""
+    return tuple(text.strip() for text in value.split(",") if text.strip()) if isinstance(value, str) else value
+
+
 Origins = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_origins)]
+Score = Annotated[float, Field(ge=0, le=1)]
+Topic = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*$", max_length=100)]
+Secrets = Annotated[tuple[SecretStr, ...], NoDecode, BeforeValidator(_texts)]
 Cameras = Annotated[tuple[WarmUpCamera, ...], NoDecode, BeforeValidator(_cameras)]
 _EUROC: Final = (WarmUpCamera(752, 480, None), WarmUpCamera(752, 480, 458.0))
 
@@ -149,6 +158,21 @@ class ServiceSettings(BaseSettings):
     max_websockets: PositiveInt = Field(default=32, description="open WebSockets")
     max_websocket_bytes: PositiveInt = Field(default=4 * MEBIBYTE, description="of one message of a WebSocket")
     websocket_idle_s: PositiveFloat = Field(default=60.0, description="after which a silent WebSocket is closed")
+    event_start_score: Score = Field(default=0.5, description="of a track, from which on it begins an event")
+    event_start_pairs: int = Field(default=3, ge=1, le=1000, description="judged pairs in a row with that score")
+    event_end_score: Score = Field(default=0.3, description="below which, or unseen, a track ends its event")
+    event_end_s: NonNegativeFloat = Field(default=2.0, description="for so long, in camera time")
+    event_update_s: NonNegativeFloat = Field(default=1.0, description="at least between two messages of one event")
+    event_cooldown_s: NonNegativeFloat = Field(default=2.0, description="after an end none begins in the stream")
+    event_ring: int = Field(default=1024, ge=1, le=100_000, description="events kept in memory without a store")
+    max_event_readers: PositiveInt = Field(default=64, description="connections to /events/live at once")
+    event_delivery_attempts: int = Field(default=15, ge=1, le=1000, description="then an event is a dead letter")
+    webhook_urls: Secrets = Field(default=(), description="who is posted every event: https://a.example/hook,...")
+    webhook_secret: SecretStr | None = Field(default=None, description="signs what is posted")
+    mqtt_url: SecretStr | None = Field(default=None, description="broker: mqtt:// or mqtts://user:password@host:port")
+    mqtt_prefix: Topic = Field(default="viflow", description="ahead of all topics of this service, and of no other")
+    mqtt_discovery_prefix: Topic = Field(default="homeassistant", description="where Home Assistant looks")
+    mqtt_ca_file: UsablePath | None = Field(default=None, description="whom mqtts:// trusts; not given: as the system")
     log_level: Literal["debug", "info", "warning", "error"] = "info"
 
     @model_validator(mode="after")

@@ -7,8 +7,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final
 
 import sqlalchemy as sa
@@ -18,7 +17,7 @@ from viflow_anomaly_service.store.engine import UNTIL, make_engine, migrate, sto
 from viflow_anomaly_service.store.failures import store_failures
 from viflow_anomaly_service.store.query import DetectionFilter, PageRequest
 from viflow_anomaly_service.store.record import Record, StoredDetection, first_id_at
-from viflow_anomaly_service.store.tables import DETECTIONS, LABELS, PROBE
+from viflow_anomaly_service.store.tables import DETECTIONS, EVENTS, LABELS, PROBE
 
 logger = logging.getLogger(__name__)
 
@@ -71,8 +70,12 @@ class DetectionStore:
     def close(self) -> None:
         self._engine.dispose()
 
-    def add(self, records: Sequence[Record]) -> None:
-        """All of them, or none; when this returns they are on the disk."""
+    def add(self, records: Sequence[Record], along: Sequence[Callable[[Connection], object]] = ()) -> None:
+        """All of them, or none; when this returns they are on the disk.
+
+        Args:
+            along: called in the same transaction, behind the detections.
+        """
         rows = [
             {
                 "id": record.id,
@@ -91,21 +94,34 @@ class DetectionStore:
             for label, score in record.top_scores.items()
         ]
         self.open()
-        with store_failures(), self._writing() as connection:
-            connection.execute(sa.insert(DETECTIONS), rows)
+        with self.transaction(writes=True) as connection:
+            if rows:
+                connection.execute(sa.insert(DETECTIONS), rows)
             if labels:
                 connection.execute(sa.insert(LABELS), labels)
+            for action in along:
+                action(connection)
+
+    @contextlib.contextmanager
+    def transaction(self, *, writes: bool = False) -> Iterator[Connection]:
+        """Committed when the block ends well.
+
+        Raises:
+            StoreError: whatever the database says against it.
+        """
+        with store_failures(), self._engine.execution_options(writes=writes).begin() as connection:
+            yield connection
 
     def probe(self) -> None:
         """Write something, to see whether that works."""
         self.open()
         padding = f"{time.time_ns():020d}".ljust(_PROBE_PADDING, ".")
-        with store_failures(), self._writing() as connection:
+        with self.transaction(writes=True) as connection:
             if not connection.execute(sa.update(PROBE).where(PROBE.c.id == 1).values(padding=padding)).rowcount:
                 connection.execute(sa.insert(PROBE).values(id=1, padding=padding))
 
     def get(self, detection_id: str) -> StoredDetection | None:
-        with store_failures(), self._engine.begin() as connection:
+        with self.transaction() as connection:
             row = connection.execute(sa.select(*_READ).where(DETECTIONS.c.id == detection_id)).one_or_none()
         return None if row is None else StoredDetection(*row)
 
@@ -116,7 +132,7 @@ class DetectionStore:
         found = sa.select(DETECTIONS.c.id, DETECTIONS.c.size_bytes).where(*_conditions(request.filter))
         if request.after is not None:
             found = found.where(DETECTIONS.c.id < request.after if falling else DETECTIONS.c.id > request.after)
-        with store_failures(), self._engine.begin() as connection:
+        with self.transaction() as connection:
             sized = connection.execute(found.order_by(by).limit(request.limit + 1)).all()
             ids = _fitting([(row.id, row.size_bytes) for row in sized[: request.limit]])
             rows = connection.execute(sa.select(*_READ).where(DETECTIONS.c.id.in_(ids)).order_by(by)).all()
@@ -145,7 +161,7 @@ class DetectionStore:
         size, newest_first = DETECTIONS.c.size_bytes, DETECTIONS.c.id.desc()
         running = sa.select(DETECTIONS.c.id, sa.func.sum(size).over(order_by=newest_first).label("total")).subquery()
         kept = sa.select(sa.func.min(running.c.id)).where(running.c.total <= max_bytes)
-        with store_failures(), self._engine.begin() as connection:
+        with self.transaction() as connection:
             total = connection.execute(sa.select(sa.func.sum(size))).scalar_one() or 0
             if total <= max_bytes:
                 return None
@@ -157,16 +173,21 @@ class DetectionStore:
         while first_kept is not None:
             old = sa.select(DETECTIONS.c.id).where(DETECTIONS.c.id < first_kept).order_by(DETECTIONS.c.id)
             old = old.limit(DELETED_AT_ONCE).with_for_update(skip_locked=True)  # another replica deletes the rest
-            with store_failures(), self._writing() as connection:
+            with self.transaction(writes=True) as connection:
                 ids = list(connection.execute(old).scalars())
                 connection.execute(sa.delete(DETECTIONS).where(DETECTIONS.c.id.in_(ids)))
             deleted += len(ids)
             if len(ids) < DELETED_AT_ONCE:
                 break
+        while first_kept is not None:  # events go with the detections of their time, and deliveries with their events
+            told = sa.select(EVENTS.c.seq).where(EVENTS.c.event_id < first_kept).order_by(EVENTS.c.seq)
+            told = told.limit(DELETED_AT_ONCE).with_for_update(skip_locked=True)
+            with self.transaction(writes=True) as connection:
+                seqs = list(connection.execute(told).scalars())
+                connection.execute(sa.delete(EVENTS).where(EVENTS.c.seq.in_(seqs)))
+            if len(seqs) < DELETED_AT_ONCE:
+                break
         return deleted
-
-    def _writing(self) -> AbstractContextManager[Connection]:
-        return self._engine.execution_options(writes=True).begin()
 
     def _found_file(self) -> tuple[int, int] | None:
         """Which file there is under the name; None where there is none."""

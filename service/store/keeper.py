@@ -10,6 +10,7 @@ from functools import partial
 from typing import Final, TypeVar
 
 from prometheus_client import Counter, Gauge
+from sqlalchemy.engine import Connection
 
 from viflow_anomaly.detection import Detection
 from viflow_anomaly_service.metrics import ServiceMetrics
@@ -23,6 +24,8 @@ from viflow_anomaly_service.store.record import IdMaker, Record, StoredDetection
 logger = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
+Along = Callable[[Connection], object]
+"""What is kept in the transaction of some detections."""
 
 COMMITTED_AT_ONCE: Final = 64
 READERS: Final = 2
@@ -67,11 +70,16 @@ class ResultKeeper:
         self._metrics = StoreMetrics(metrics)
         self._new_id = IdMaker()
         self._failure: StoreError | None = store_error("store_opening")
-        self._waiting: list[tuple[list[Record], asyncio.Future[None]]] = []
+        self._waiting: list[tuple[list[Record], Along | None, asyncio.Future[None]]] = []
         self._committing: asyncio.Task[None] | None = None
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="store-write")
         self._readers = ThreadPoolExecutor(READERS, thread_name_prefix="store-read")
         self._tasks: list[asyncio.Task[None]] = []
+
+    @property
+    def store(self) -> DetectionStore:
+        """For parts that keep something beside the detections, by ``change`` and ``read``."""
+        return self._store
 
     def start(self) -> None:
         """Open the store, and look after it; a store that cannot be opened is tried again later."""
@@ -105,8 +113,12 @@ class ResultKeeper:
         *,
         stream_id: str | None = None,
         session_id: str | None = None,
+        along: Callable[[list[str]], Along | None] = lambda ids: None,
     ) -> list[str]:
         """The ids under which detections, each with its JSON, are kept; when this returns they are on the disk.
+
+        Args:
+            along: given the ids, what is kept with the detections, or not at all.
 
         Raises:
             Problem: 503 ``store_...``: they were not kept, or nobody knows.
@@ -119,10 +131,23 @@ class ResultKeeper:
             for detection, body in detections
         ]
         try:
-            await self._committed(records)
+            await self._committed(records, along([record.id for record in records]))
         except StoreError as err:
             raise store_problem(err) from err
         return [record.id for record in records]
+
+    async def change(self, action: Callable[[], Result]) -> Result:
+        """What ``action`` gives, which writes to the store's database.
+
+        Raises:
+            Problem: 503 ``store_...``: nothing was written, or nobody knows.
+        """
+        self.require_usable()
+        results: list[Result] = []
+        failure = await self._write(lambda: results.append(action()))
+        if failure is not None:
+            raise store_problem(failure) from failure
+        return results[0]
 
     async def get(self, detection_id: str) -> StoredDetection | None:
         """A stored detection; None: there is none of this id (any more).
@@ -130,7 +155,7 @@ class ResultKeeper:
         Raises:
             Problem: 503 ``store_...``.
         """
-        return await self._read(lambda: self._store.get(detection_id))
+        return await self.read(lambda: self._store.get(detection_id))
 
     async def page(self, request: PageRequest) -> tuple[list[StoredDetection], str | None]:
         """Detections, and the cursor behind them where there are more.
@@ -138,7 +163,7 @@ class ResultKeeper:
         Raises:
             Problem: 503 ``store_...``.
         """
-        found, more = await self._read(lambda: self._store.page(request))
+        found, more = await self.read(lambda: self._store.page(request))
         return found, cursor_of(request.filter, found[-1].id) if more and found else None
 
     async def export(self, chosen: DetectionFilter, first: list[StoredDetection], *, rows: int) -> AsyncIterator[bytes]:
@@ -153,10 +178,10 @@ class ResultKeeper:
             yield "".join(f"{one.to_json()}\n" for one in found).encode()
             found, _ = await self.page(PageRequest(chosen, rows, found[-1].id))
 
-    async def _committed(self, records: list[Record]) -> None:
+    async def _committed(self, records: list[Record], along: Along | None) -> None:
         """Once all of them are on the disk; else none is."""
         done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._waiting.append((records, done))
+        self._waiting.append((records, along, done))
         if self._committing is None or self._committing.done():
             self._committing = asyncio.create_task(self._commit())
         await done
@@ -165,13 +190,14 @@ class ResultKeeper:
         """Until nothing waits; what comes meanwhile goes together into the next transaction."""
         while self._waiting:
             batch, self._waiting = self._waiting[:COMMITTED_AT_ONCE], self._waiting[COMMITTED_AT_ONCE:]
-            records = [record for together, _ in batch for record in together]
+            records = [record for together, _, _ in batch for record in together]
+            along = [action for _, action, _ in batch if action is not None]
             failure: Exception | None
             try:
-                failure = await self._write(partial(self._store.add, records))
+                failure = await self._write(partial(self._store.add, records, along))
             except Exception as err:  # a fault of ours: those who wait are told, those behind them are served
                 failure = err
-            for _, done in batch:
+            for _, _, done in batch:
                 if done.done():  # its client has gone
                     continue
                 if failure is None:
@@ -199,7 +225,12 @@ class ResultKeeper:
         self._metrics.usable.set(failure is None)
         return failure
 
-    async def _read(self, action: Callable[[], Result]) -> Result:
+    async def read(self, action: Callable[[], Result]) -> Result:
+        """What ``action`` reads from the store's database.
+
+        Raises:
+            Problem: 503 ``store_...``.
+        """
         if self._failure is not None and self._failure.code == "store_opening":
             raise store_problem(self._failure)
         try:
@@ -228,7 +259,7 @@ class ResultKeeper:
         while True:
             if self._failure is None or self._failure.code == "store_full":
                 try:
-                    deleted = await self._read(lambda: self._store.prune(max_age_s=age_s, max_bytes=size))
+                    deleted = await self.read(lambda: self._store.prune(max_age_s=age_s, max_bytes=size))
                 except Problem as problem:
                     logger.warning("store_not_pruned", extra={"code": problem.code})
                 except Exception:  # as above

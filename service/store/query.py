@@ -8,11 +8,14 @@ import hashlib
 import json
 import re
 from dataclasses import asdict, dataclass
-from typing import Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 from viflow_anomaly.regions import RegionLabel
 from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.schemas import INT64_MAX
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 DEFAULT_LIMIT: Final = 100
 MAX_LIMIT: Final = 1000
@@ -61,7 +64,7 @@ def read_filter(parameters: list[tuple[str, str]]) -> DetectionFilter:
     Raises:
         Problem: 422 with the parameter at fault.
     """
-    return _filter(_once(parameters, FILTER_NAMES))
+    return _filter(parameters_once(parameters, FILTER_NAMES))
 
 
 def read_page(parameters: list[tuple[str, str]]) -> PageRequest:
@@ -70,15 +73,15 @@ def read_page(parameters: list[tuple[str, str]]) -> PageRequest:
     Raises:
         Problem: 422 with the parameter at fault; ``cursor_invalid`` also for a cursor of another filter.
     """
-    given = _once(parameters, (*FILTER_NAMES, "limit", "cursor"))
+    given = parameters_once(parameters, (*FILTER_NAMES, "limit", "cursor"))
     chosen = _filter(given)
-    limit = _integer(given, "limit", 1, MAX_LIMIT)
+    limit = integer_parameter(given, "limit", 1, MAX_LIMIT)
     cursor = given.get("cursor")
-    after = None if cursor is None else _after(cursor, chosen)
+    after = None if cursor is None else place_of_cursor(cursor, chosen)
     return PageRequest(chosen, DEFAULT_LIMIT if limit is None else limit, after)
 
 
-def cursor_of(chosen: DetectionFilter, last_id: str) -> str:
+def cursor_of(chosen: DataclassInstance, last_id: str) -> str:
     """Opaque text from which the page behind ``last_id`` is found again."""
     text = json.dumps([1, _digest(chosen), last_id], separators=(",", ":"))
     return base64.urlsafe_b64encode(text.encode()).decode().rstrip("=")
@@ -100,26 +103,51 @@ def detection_not_found(text: str) -> Problem:
 
 
 def _filter(given: dict[str, str]) -> DetectionFilter:
-    from_ns = _integer(given, "from_ns", -INT64_MAX - 1, INT64_MAX)
-    to_ns = _integer(given, "to_ns", -INT64_MAX - 1, INT64_MAX)
-    if from_ns is not None and to_ns is not None and to_ns <= from_ns:
-        raise _wrong("to_ns", f"a time later than from_ns={from_ns}", str(to_ns))
-    stream, score = given.get("stream"), given.get("min_score")
-    if stream is not None and STREAM_ID.fullmatch(stream) is None:
-        raise _wrong("stream", "1 to 64 of A-Z a-z 0-9 . _ -", stream)
+    from_ns, to_ns = time_parameters(given)
+    score = given.get("min_score")
     if score is not None and (_NUMBER.fullmatch(score) is None or float(score) > 1):
-        raise _wrong("min_score", "a number from 0 to 1", score)
+        raise wrong_parameter("min_score", "a number from 0 to 1", score)
     return DetectionFilter(
-        stream=stream,
+        stream=stream_parameter(given, "stream"),
         from_ns=from_ns,
         to_ns=to_ns,
-        label=_choice(given, "label", LABELS),
+        label=choice_parameter(given, "label", LABELS),
         min_score=None if score is None else float(score),
-        order="asc" if _choice(given, "order", ORDERS) == "asc" else "desc",
+        order="asc" if choice_parameter(given, "order", ORDERS) == "asc" else "desc",
     )
 
 
-def _once(parameters: list[tuple[str, str]], known: tuple[str, ...]) -> dict[str, str]:
+def time_parameters(given: dict[str, str]) -> tuple[int | None, int | None]:
+    """``from_ns`` and ``to_ns``.
+
+    Raises:
+        Problem: 422 ``parameter_invalid``.
+    """
+    from_ns = integer_parameter(given, "from_ns", -INT64_MAX - 1, INT64_MAX)
+    to_ns = integer_parameter(given, "to_ns", -INT64_MAX - 1, INT64_MAX)
+    if from_ns is not None and to_ns is not None and to_ns <= from_ns:
+        raise wrong_parameter("to_ns", f"a time later than from_ns={from_ns}", str(to_ns))
+    return from_ns, to_ns
+
+
+def stream_parameter(given: dict[str, str], name: str) -> str | None:
+    """The id of a stream.
+
+    Raises:
+        Problem: 422 ``parameter_invalid``.
+    """
+    stream = given.get(name)
+    if stream is not None and STREAM_ID.fullmatch(stream) is None:
+        raise wrong_parameter(name, "1 to 64 of A-Z a-z 0-9 . _ -", stream)
+    return stream
+
+
+def parameters_once(parameters: list[tuple[str, str]], known: tuple[str, ...]) -> dict[str, str]:
+    """The parameters by name.
+
+    Raises:
+        Problem: 422 ``parameter_unknown``, or ``parameter_invalid`` for one that is there twice.
+    """
     given: dict[str, str] = {}
     for name, value in parameters:
         if name not in known:
@@ -132,28 +160,33 @@ def _once(parameters: list[tuple[str, str]], known: tuple[str, ...]) -> dict[str
     return given
 
 
-def _integer(given: dict[str, str], name: str, least: int, most: int) -> int | None:
+def integer_parameter(given: dict[str, str], name: str, least: int, most: int) -> int | None:
     text = given.get(name)
     if text is None:
         return None
     if _INTEGER.fullmatch(text) is None or not least <= int(text) <= most:
-        raise _wrong(name, f"an integer from {least} to {most}", text)
+        raise wrong_parameter(name, f"an integer from {least} to {most}", text)
     return int(text)
 
 
-def _choice(given: dict[str, str], name: str, choices: tuple[str, ...]) -> str | None:
+def choice_parameter(given: dict[str, str], name: str, choices: tuple[str, ...]) -> str | None:
     text = given.get(name)
     if text is not None and text not in choices:
-        raise _wrong(name, " or ".join(choices), text)
+        raise wrong_parameter(name, " or ".join(choices), text)
     return text
 
 
-def _wrong(name: str, expected: str, found: str) -> Problem:
+def wrong_parameter(name: str, expected: str, found: str) -> Problem:
     detail = f"{name}: expected {expected}, found {found!r:.80}"
     return Problem(422, code="parameter_invalid", detail=detail, field=name)
 
 
-def _after(cursor: str, chosen: DetectionFilter) -> str:
+def place_of_cursor(cursor: str, chosen: DataclassInstance) -> str:
+    """The id behind which a page begins.
+
+    Raises:
+        Problem: 422 ``cursor_invalid``.
+    """
     padded = cursor[:MAX_CURSOR] + "=" * (-len(cursor) % 4)
     try:
         value: Any = json.loads(base64.b64decode(padded, altchars=b"-_", validate=True))
@@ -172,5 +205,5 @@ def _wrong_cursor(found: str) -> Problem:
     return Problem(422, code="cursor_invalid", detail=detail, field="cursor")
 
 
-def _digest(chosen: DetectionFilter) -> str:
+def _digest(chosen: DataclassInstance) -> str:
     return hashlib.sha256(json.dumps(asdict(chosen), sort_keys=True).encode()).hexdigest()[:16]

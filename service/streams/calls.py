@@ -106,12 +106,16 @@ async def _kept(core: ServiceCore, stream: LiveStream, judged: JudgedCall) -> by
     """The stream advances once its detections are on the disk: a call that was refused can be sent again."""
     step, received = judged.step, judged.received
     core.streams.require_room(stream, step.state)
+    noticed = core.events.desk.notice(stream, step.detections)
     ids = None
     if core.keeper is not None:
         pairs = list(zip(step.detections, judged.bodies, strict=True))
-        ids = await core.keeper.keep(pairs, stream_id=stream.stream_id, session_id=stream.session_id)
+        ids = await core.keeper.keep(
+            pairs, stream_id=stream.stream_id, session_id=stream.session_id, along=noticed.kept_along
+        )
     begun = stream.begun is None
     core.streams.advance(stream, judged.begun, step)
+    core.events.desk.took(noticed)
     if received.frame is not None:
         stream.received_frames += 1
     if received.imu is not None:

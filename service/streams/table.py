@@ -11,7 +11,7 @@ import logging
 import time
 import uuid
 from collections import Counter as Tally
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -19,6 +19,7 @@ from prometheus_client import Counter
 
 from viflow_anomaly.stream import StreamState, StreamStep
 from viflow_anomaly_service.admission import AdmissionGate
+from viflow_anomaly_service.events.event_rules import EndReason, EventState
 from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.settings import ServiceSettings
@@ -40,6 +41,7 @@ class LiveStream:
         state: after the last call that was answered.
         calls: at work or waiting for their turn.
         gone: deleted or expired; whoever still waits begins another one.
+        events: what is open, after the same call.
     """
 
     stream_id: str
@@ -55,6 +57,7 @@ class LiveStream:
     received_imu_samples: int = 0
     judged_pairs: int = 0
     faults: Tally[str] = field(default_factory=Tally)
+    events: EventState = field(default_factory=EventState)
 
     @property
     def state_bytes(self) -> int:
@@ -99,9 +102,18 @@ class StreamTable:
         settings: how many, how large, how long.
         gate: counts who is refused.
         metrics: told of the streams.
+        on_forget: called with each stream that is let go, and why.
     """
 
-    def __init__(self, settings: ServiceSettings, gate: AdmissionGate, metrics: ServiceMetrics) -> None:
+    def __init__(
+        self,
+        settings: ServiceSettings,
+        gate: AdmissionGate,
+        metrics: ServiceMetrics,
+        *,
+        on_forget: Callable[[LiveStream, EndReason], None] = lambda stream, reason: None,
+    ) -> None:
+        self._on_forget = on_forget
         self._settings = settings
         self._gate = gate
         self._streams: dict[str, LiveStream] = {}
@@ -126,11 +138,12 @@ class StreamTable:
             raise Problem(404, code="stream_not_found", detail=detail)
         return found
 
-    def forget(self, stream: LiveStream) -> None:
+    def forget(self, stream: LiveStream, reason: EndReason = "stream_deleted") -> None:
         """Let a stream go; a call at work is still answered."""
         stream.gone = True
         if self._streams.get(stream.stream_id) is stream:
             del self._streams[stream.stream_id]
+        self._on_forget(stream, reason)
         self._observe()
 
     @contextlib.asynccontextmanager
@@ -200,7 +213,7 @@ class StreamTable:
         now = time.monotonic()
         for stream in list(self._streams.values()):
             if not stream.calls and now - stream.used_at > self._settings.stream_idle_s:
-                self.forget(stream)
+                self.forget(stream, "stream_expired")
                 logger.info("stream_expired", extra={"stream": stream.stream_id, "pairs": stream.judged_pairs})
 
     def _new(self, stream_id: str) -> LiveStream:

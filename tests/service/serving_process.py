@@ -23,6 +23,8 @@ from rule_detector import RuleDetector
 from viflow_anomaly_service.server import run
 from viflow_anomaly_service.settings import load_settings
 
+{setup}
+
 class SlowDetector(RuleDetector):
     def detect(self, pair, *, decode_ms=0.0):
         time.sleep({delay_s})
@@ -71,13 +73,14 @@ class ServingProcess:
 
 @contextlib.contextmanager
 def serving_process(
-    *, delay_s: float = 0.0, before_load: str = "pass", ready: bool = True, **settings: Any
+    *, delay_s: float = 0.0, before_load: str = "pass", setup: str = "pass", ready: bool = True, **settings: Any
 ) -> Iterator[ServingProcess]:
     """Start it, wait until it is ready (each of its processes), and make sure that it has ended afterwards.
 
     Args:
         delay_s: what every pair takes.
         before_load: a statement that every process executes before it has its detector.
+        setup: statements that every process executes first of all; may give ``RuleDetector`` another meaning.
         ready: False: wait only until it listens.
         settings: of the service.
     """
@@ -85,6 +88,7 @@ def serving_process(
         tests=str(Path(__file__).parent),
         delay_s=delay_s,
         before_load=before_load,
+        setup=setup,
         settings={"warm_up": ""} | settings,
     )
     process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, env=os.environ)

@@ -91,6 +91,12 @@ def test_a_key_opens_what_its_scope_says(guarded: Guarded) -> None:
             guarded.server.client.delete("/detect", headers=headers).status_code,
         )
     assert answers == {"drone": (200, 403, 200, 403), "reader": (403, 200, 200, 403), "boss": (200, 200, 200, 405)}
+    for path, statuses in (("/events", (403, 501, 501)), ("/events/deliveries", (403, 403, 501))):
+        found = [guarded.server.client.get(path, headers=guarded.bearer(name)).status_code for name in answers]
+        assert tuple(found) == statuses
+    retry = f"/events/deliveries/{'0' * 32}.mqtt/retry"
+    found = [guarded.server.client.post(retry, headers=guarded.bearer(name)).status_code for name in answers]
+    assert found == [403, 403, 501]
     refused = guarded.server.post_json(json_request(), headers=guarded.bearer("reader"))
     assert_problem(refused, 403, "scope_missing", None)
 

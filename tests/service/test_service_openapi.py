@@ -12,6 +12,7 @@ import pytest
 from rule_detector import RuleDetector
 from service_world import LiveServer, json_request, live_server
 
+from viflow_anomaly_service.events.query import EVENT_FILTER_NAMES
 from viflow_anomaly_service.examples import (
     EXAMPLE_FAULTS,
     INTERVAL_NS,
@@ -76,6 +77,11 @@ def test_operation_ids_are_stable(document: dict[str, Any]) -> None:
         ("/detections", "get"): "listDetections",
         ("/detections.ndjson", "get"): "exportDetections",
         ("/detections/{detection_id}", "get"): "getDetection",
+        ("/events", "get"): "listEvents",
+        ("/events.ndjson", "get"): "exportEvents",
+        ("/events/live", "get"): "liveEvents",
+        ("/events/deliveries", "get"): "listDeliveries",
+        ("/events/deliveries/{delivery_id}/retry", "post"): "retryDelivery",
         ("/streams", "get"): "listStreams",
         ("/streams/{stream_id}", "get"): "getStream",
         ("/streams/{stream_id}", "delete"): "deleteStream",
@@ -200,6 +206,12 @@ def test_the_parameters_of_a_list_are_documented(document: dict[str, Any]) -> No
     for path, refused in (("/detections", ()), ("/detections.ndjson", ("limit", "cursor"))):
         documented = {one["name"] for one in document["paths"][path]["get"]["parameters"]}
         assert documented == {*FILTER_NAMES, "limit", "cursor"} - {*refused}
+
+
+def test_the_parameters_of_the_lists_of_events_are_documented(document: dict[str, Any]) -> None:
+    for path, refused in (("/events", ()), ("/events.ndjson", ("limit", "cursor"))):
+        documented = {one["name"] for one in document["paths"][path]["get"]["parameters"]}
+        assert documented == {*EVENT_FILTER_NAMES, "limit", "cursor"} - {*refused}
 
 
 def test_docs_page_is_served(server: LiveServer) -> None:

@@ -41,6 +41,12 @@ def test_argument_over_environment_over_default(monkeypatch: pytest.MonkeyPatch)
         ("VIFLOW_QUEUE_TIMEOUT_S", "inf", "queue_timeout_s"),
         ("VIFLOW_LOG_LEVEL", "loud", "log_level"),
         ("VIFLOW_WORKERS", "0", "workers"),
+        ("VIFLOW_EVENT_START_SCORE", "1.1", "event_start_score"),
+        ("VIFLOW_EVENT_START_PAIRS", "0", "event_start_pairs"),
+        ("VIFLOW_EVENT_END_S", "-1", "event_end_s"),
+        ("VIFLOW_EVENT_COOLDOWN_S", "inf", "event_cooldown_s"),
+        ("VIFLOW_MQTT_PREFIX", "a/#", "mqtt_prefix"),
+        ("VIFLOW_MQTT_DISCOVERY_PREFIX", "/a", "mqtt_discovery_prefix"),
         ("VIFLOW_WARM_UP", "752", "warm_up"),
         ("VIFLOW_WARM_UP", "752x480,0x1", "warm_up"),
         ("VIFLOW_WARM_UP", "752x480@0", "warm_up"),
@@ -106,6 +112,16 @@ def test_cores_are_shared_out_among_the_processes(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("viflow_anomaly_service.settings._usable_cores", lambda: 8)
     assert [ServiceSettings(workers=count).workers_at_once for count in (1, 2, 3, 16)] == [8, 4, 3, 1]
     assert ServiceSettings(workers=2, max_concurrent=5).workers_at_once == 5
+
+
+def test_secrets_of_sinks_are_shown_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VIFLOW_WEBHOOK_URLS", "https://a.example/token1, https://b.example/token2")
+    monkeypatch.setenv("VIFLOW_WEBHOOK_SECRET", "token3")
+    monkeypatch.setenv("VIFLOW_MQTT_URL", "mqtt://user:token4@c.example")
+    settings = load_settings()
+    assert [one.get_secret_value() for one in settings.webhook_urls][1] == "https://b.example/token2"
+    assert "token" not in settings.model_dump_json()
+    assert "token" not in repr(settings)
 
 
 def test_cameras_to_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -366,7 +366,7 @@ def test_a_call_that_could_not_be_stored_can_be_sent_again(
     with live_server(lambda settings: DifferenceDetector(), store_url=str(tmp_path / "x.db")) as server:
         accepted(server, "again", call(world, 0))
 
-        def fail(self: DetectionStore, records: object) -> None:
+        def fail(self: DetectionStore, *given: object) -> None:
             raise store_error("store_full")
 
         with monkeypatch.context() as failing:

@@ -1,0 +1,154 @@
+"""What a client may ask of events: filters, a page, the place where a live stream goes on."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Final, get_args
+
+from viflow_anomaly_service.events.event_rules import EventKind
+from viflow_anomaly_service.problems import Problem
+from viflow_anomaly_service.store.query import (
+    DEFAULT_LIMIT,
+    DETECTION_ID,
+    MAX_LIMIT,
+    ORDERS,
+    Order,
+    choice_parameter,
+    integer_parameter,
+    parameters_once,
+    place_of_cursor,
+    stream_parameter,
+    time_parameters,
+    wrong_parameter,
+)
+
+KINDS: Final[tuple[str, ...]] = get_args(EventKind)
+EVENT_FILTER_NAMES: Final = ("stream_id", "kind", "from_ns", "to_ns", "order")
+DELIVERY_STATES: Final = ("pending", "delivered", "dead")
+DELIVERY_ID: Final = re.compile(r"(?P<event>[0-9a-f]{32})\.(?P<sink>mqtt|webhook-[0-9a-f]{12})", re.ASCII)
+EVENT_ID: Final = DETECTION_ID
+"""Ids of events are made as those of detections are."""
+
+
+@dataclass(frozen=True)
+class EventFilter:
+    """Which events, in which order; None does not filter.
+
+    Attributes:
+        from_ns, to_ns: source frame at or after, and before, in camera time.
+        order: as they were kept, newest ("desc") or oldest first.
+    """
+
+    stream_id: str | None = None
+    kind: str | None = None
+    from_ns: int | None = None
+    to_ns: int | None = None
+    order: Order = "desc"
+
+
+@dataclass(frozen=True)
+class EventPage:
+    """One page of what passes the filter, behind the event ``after``."""
+
+    filter: EventFilter
+    limit: int = DEFAULT_LIMIT
+    after: str | None = None
+
+
+@dataclass(frozen=True)
+class DeliveryFilter:
+    """Which deliveries; None does not filter."""
+
+    state: str | None = None
+
+
+@dataclass(frozen=True)
+class DeliveryPage:
+    """One page of deliveries, oldest event first, behind the one with the id ``after``."""
+
+    filter: DeliveryFilter
+    limit: int
+    after: str | None
+
+
+def read_event_filter(parameters: list[tuple[str, str]]) -> EventFilter:
+    """The filter of an export.
+
+    Raises:
+        Problem: 422 with the parameter at fault.
+    """
+    return _filter(parameters_once(parameters, EVENT_FILTER_NAMES))
+
+
+def read_event_page(parameters: list[tuple[str, str]]) -> EventPage:
+    """A page's filter, size and place.
+
+    Raises:
+        Problem: 422 with the parameter at fault; ``cursor_invalid`` also for a cursor of another filter.
+    """
+    given = parameters_once(parameters, (*EVENT_FILTER_NAMES, "limit", "cursor"))
+    chosen, cursor = _filter(given), given.get("cursor")
+    after = None if cursor is None else place_of_cursor(cursor, chosen)
+    return EventPage(chosen, integer_parameter(given, "limit", 1, MAX_LIMIT) or DEFAULT_LIMIT, after)
+
+
+def read_delivery_page(parameters: list[tuple[str, str]]) -> DeliveryPage:
+    """A page of deliveries.
+
+    Raises:
+        Problem: 422 with the parameter at fault.
+    """
+    given = parameters_once(parameters, ("state", "limit", "cursor"))
+    chosen, cursor = DeliveryFilter(choice_parameter(given, "state", DELIVERY_STATES)), given.get("cursor")
+    after = None if cursor is None else place_of_cursor(cursor, chosen)
+    return DeliveryPage(chosen, integer_parameter(given, "limit", 1, MAX_LIMIT) or DEFAULT_LIMIT, after)
+
+
+def read_live_stream(parameters: list[tuple[str, str]]) -> str | None:
+    """The stream whose events are wanted; None: of all.
+
+    Raises:
+        Problem: 422 with the parameter at fault.
+    """
+    return stream_parameter(parameters_once(parameters, ("stream_id",)), "stream_id")
+
+
+def read_last_event_id(text: str | None) -> str | None:
+    """The id behind which to go on; None: with what comes now.
+
+    Raises:
+        Problem: 422 ``parameter_invalid``.
+    """
+    if not text:
+        return None
+    if EVENT_ID.fullmatch(text) is None:
+        raise wrong_parameter("Last-Event-ID", "the id of an event", text)
+    return text
+
+
+def require_delivery_id(text: str) -> tuple[str, str]:
+    """Event and sink.
+
+    Raises:
+        Problem: 404 ``delivery_not_found`` for what cannot be one.
+    """
+    found = DELIVERY_ID.fullmatch(text)
+    if found is None:
+        raise delivery_not_found(text)
+    return found["event"], found["sink"]
+
+
+def delivery_not_found(text: str) -> Problem:
+    return Problem(404, code="delivery_not_found", detail=f"expected the id of a delivery, found {text!r:.80}")
+
+
+def _filter(given: dict[str, str]) -> EventFilter:
+    from_ns, to_ns = time_parameters(given)
+    return EventFilter(
+        stream_id=stream_parameter(given, "stream_id"),
+        kind=choice_parameter(given, "kind", KINDS),
+        from_ns=from_ns,
+        to_ns=to_ns,
+        order="asc" if choice_parameter(given, "order", ORDERS) == "asc" else "desc",
+    )
