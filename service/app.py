@@ -13,10 +13,13 @@ from fastapi import FastAPI
 from viflow_anomaly.pair_detector import PairDetector
 from viflow_anomaly_service.access_control import add_access_control
 from viflow_anomaly_service.admission import AdmissionGate
+from viflow_anomaly_service.dashboard.static_files import add_dashboard
 from viflow_anomaly_service.detect_endpoint import add_detect
 from viflow_anomaly_service.detector_loading import DetectorLoader, load_bundled_or_configured, warm_up
 from viflow_anomaly_service.detector_pool import DetectorPool
 from viflow_anomaly_service.detector_slot import DetectorSlot
+from viflow_anomaly_service.live.endpoints import add_live
+from viflow_anomaly_service.live.pair_memory import PairMemory
 from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.models_endpoint import add_models
 from viflow_anomaly_service.openapi import complete_openapi
@@ -87,6 +90,9 @@ def create_app(
     complete_openapi(app)
     add_detections(app, core)
     add_streams(app, core)
+    add_live(app, core)
+    if core.settings.dashboard:
+        add_dashboard(app)
     return app
 
 
@@ -113,6 +119,7 @@ def _build(
         pool=pool,
         keeper=configured_keeper(settings, metrics),
         streams=StreamTable(settings, gate, metrics),
+        live=PairMemory(settings, metrics),
     )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from viflow_anomaly_service.admission import AdmissionGate
 from viflow_anomaly_service.detector_pool import DetectorPool
 from viflow_anomaly_service.detector_slot import DetectorSlot
+from viflow_anomaly_service.live.pair_memory import PairMemory
 from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.settings import ServiceSettings
 from viflow_anomaly_service.streams.table import StreamTable
@@ -28,6 +29,7 @@ class ServiceCore:
         pool: who does the work.
         keeper: where detections stay; None: nowhere.
         streams: what is remembered between frames.
+        live: the pairs that were judged a moment ago.
     """
 
     settings: ServiceSettings
@@ -37,3 +39,4 @@ class ServiceCore:
     pool: DetectorPool
     keeper: ResultKeeper | None
     streams: StreamTable
+    live: PairMemory

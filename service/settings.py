@@ -131,6 +131,9 @@ class ServiceSettings(BaseSettings):
     max_streams: PositiveInt = Field(default=64, description="streams at once")
     max_stream_bytes: PositiveInt = Field(default=256 * MEBIBYTE, description="what all streams remember together")
     stream_idle_s: PositiveFloat = Field(default=60.0, description="after which a stream is forgotten")
+    live_pairs: NonNegativeInt = Field(default=120, description="recent pairs of a stream to look at; 0: none")
+    live_bytes: PositiveInt = Field(default=256 * MEBIBYTE, description="of all recent pairs together")
+    dashboard: bool = Field(default=True, description="the page at /")
     log_level: Literal["debug", "info", "warning", "error"] = "info"
 
     @property

@@ -66,6 +66,9 @@ SERVICE_SETTINGS = (
     "max_streams",
     "max_stream_bytes",
     "stream_idle_s",
+    "live_pairs",
+    "live_bytes",
+    "dashboard",
     "log_level",
 )
 """What the service alone takes and checks. It is built on the library, which cannot ask it; a test compares the two."""

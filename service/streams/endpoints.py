@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import time
+from collections.abc import Sequence
 from http import HTTPStatus
 
 from fastapi import FastAPI, Request, Response
@@ -69,6 +70,7 @@ def add_streams(app: FastAPI, core: ServiceCore) -> None:
         """Forget a stream: the next frame of this name begins another one."""
         _require_one_process(core)
         core.streams.forget(core.streams.require(stream_id))
+        core.live.forget(stream_id)
         return Response(status_code=204)
 
     add_streams_openapi(app)
@@ -137,6 +139,17 @@ async def _judged_and_kept(core: ServiceCore, stream: LiveStream, work: StreamWo
         raise
 
 
+def _show(core: ServiceCore, stream: LiveStream, judged: JudgedCall, ids: Sequence[str] | None) -> None:
+    """The pairs of a call to whoever looks on."""
+    if not core.live.enabled or not judged.pairs:
+        return
+    rig = judged.step.state.rig
+    report = None if rig is None else rig.report(judged.stream.config.rig_estimate)
+    for place, pair in enumerate(judged.pairs):
+        stored = None if ids is None else ids[place]
+        core.live.remember(stream.stream_id, stream.session_id, pair, detection_id=stored, rig=report)
+
+
 async def _kept(core: ServiceCore, stream: LiveStream, judged: JudgedCall) -> bytes:
     """The stream advances once its detections are on the disk: a call that was refused can be sent again."""
     step, received = judged.step, judged.received
@@ -147,6 +160,7 @@ async def _kept(core: ServiceCore, stream: LiveStream, judged: JudgedCall) -> by
         ids = await core.keeper.keep(pairs, stream_id=stream.stream_id, session_id=stream.session_id)
     begun = stream.setup is None
     core.streams.advance(stream, judged.setup, judged.stream, step)
+    _show(core, stream, judged, ids)
     if received.frame is not None:
         stream.received_frames += 1
     if received.imu is not None:

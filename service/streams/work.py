@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, cast
 
 from pydantic import ValidationError
@@ -13,11 +13,13 @@ from pydantic import ValidationError
 from viflow_anomaly.datasets.camera_json import camera_from_mapping
 from viflow_anomaly.detection import Detection, to_json
 from viflow_anomaly.errors import ViflowError
+from viflow_anomaly.inspection import PairSigns, pair_signs
 from viflow_anomaly.pair_detector import PairDetector
 from viflow_anomaly.prediction import PredictedFlow
 from viflow_anomaly.sensor_data import FramePair
-from viflow_anomaly.stream import DetectionStream, Judged, StreamConfig, StreamState, StreamStep
+from viflow_anomaly.stream import DetectionStream, Judged, PairJudge, StreamConfig, StreamState, StreamStep
 from viflow_anomaly_service.detector_pool import Job
+from viflow_anomaly_service.live.pair_memory import JudgedPair
 from viflow_anomaly_service.metrics import ServiceMetrics, Stage
 from viflow_anomaly_service.problems import Problem, problem_of_error, problem_of_validation
 from viflow_anomaly_service.settings import ServiceSettings
@@ -34,6 +36,7 @@ class JudgedCall:
         setup, stream: of the stream from now on.
         step: the state behind it, detections and faults.
         bodies: the detections' JSON.
+        pairs: what each of them was made from.
     """
 
     received: StreamInput
@@ -41,6 +44,7 @@ class JudgedCall:
     stream: DetectionStream
     step: StreamStep
     bodies: list[str]
+    pairs: list[JudgedPair]
 
 
 class _Analyzing(Protocol):
@@ -63,6 +67,23 @@ class StreamJudge:
         if hasattr(self.detector, "analyze"):
             return cast(_Analyzing, self.detector).analyze(pair, decode_ms=decode_ms)
         return _DetectionOnly(self.detector.detect(pair, decode_ms=decode_ms))
+
+
+class ObservedJudge:
+    """Notes which pairs a call judged, so that they can be looked at afterwards.
+
+    Attributes:
+        seen: pair and signs of each, in order.
+    """
+
+    def __init__(self, judge: PairJudge) -> None:
+        self._judge = judge
+        self.seen: list[tuple[FramePair, PairSigns]] = []
+
+    def analyze(self, pair: FramePair, *, decode_ms: float = 0.0) -> Judged:
+        judged = self._judge.analyze(pair, decode_ms=decode_ms)
+        self.seen.append((pair, pair_signs(pair, judged.predicted)))
+        return judged
 
 
 class StreamWork:
@@ -115,14 +136,20 @@ class StreamWork:
             setup, stream = self._stream_of(received)
         job.require_wanted()
         with self._stage("detect"):
-            step = feed(stream, self._state, received)
+            observed = ObservedJudge(stream.detector)
+            step = feed(replace(stream, detector=observed), self._state, received)
         job.require_wanted()
         with self._stage("encode"):
             bodies = [to_json(detection) for detection in step.detections]
         for detection in step.detections:
             self._metrics.observe_detection(detection)
         self.log |= {"pairs": len(bodies), "faults": len(step.faults)}
-        return JudgedCall(received, setup, stream, step, bodies)
+        detector = cast(StreamJudge, stream.detector).detector  # as new_stream makes it
+        pairs = [
+            JudgedPair(pair, detector, detection, body, signs)
+            for (pair, signs), detection, body in zip(observed.seen, step.detections, bodies, strict=True)
+        ]
+        return JudgedCall(received, setup, stream, step, bodies, pairs)
 
     def _stream_of(self, received: StreamInput) -> tuple[StreamSetup, DetectionStream]:
         said = received.setup
