@@ -5,7 +5,7 @@ import { state, subscribe } from "./state.js";
 import { isOpen } from "./tabs.js";
 import { nameOfStream } from "./words.js";
 
-const COMMAND = "viflow-anomaly calibrate RECORDING... --budget 1 --out calibration.json\nviflow-anomaly serve --calibration calibration.json";
+const COMMAND = "viflow-anomaly calibrate RECORDING... \\\n  --false-alarms-per-hour 10 --out hall.json\nviflow-anomaly serve --calibration hall.json";
 const rounded = (value) => (value >= 100 ? Math.round(value).toLocaleString() : Number(value.toPrecision(3)).toString());
 
 export function addBudgetPanel(panel) {

@@ -47,11 +47,10 @@ export function addEventsPanel(panel) {
 }
 
 function trackItem(track) {
-  const seconds = (track.best.detection.source_timestamp_ns / 1e9).toFixed(2);
   return h("li", {}, h("button", { type: "button", class: "list-button", onclick: () => lookAt(track.best.number) },
     thumbnailOf(track.best.detection_id),
     h("span", { class: "grow" }, h("strong", {}, track.id === null ? "Without a track" : `Track ${track.id}`),
-      h("span", { class: "muted" }, ` ${counted(track.pairs, "pair")}, best at ${seconds} s`)),
+      h("span", { class: "muted" }, ` ${counted(track.pairs, "pair")}, best ${ago(track.best.received_at_ns)}`)),
     h("span", { class: "score" }, track.score.toFixed(2))));
 }
 

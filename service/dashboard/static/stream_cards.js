@@ -16,6 +16,7 @@ export function addCards() {
 
 function drawCards() {
   const list = byId("stream-cards");
+  list.classList.toggle("alone", cards.size === 1);
   for (const [id, card] of cards) {
     if (!state.streams.get(id)?.pairs.length) {
       card.item.remove();
@@ -40,7 +41,7 @@ function newCard(id) {
   const status = h("span", { class: "card-status" });
   const numbers = h("span", { class: "card-numbers" });
   const button = h("button", { type: "button", class: "card", onclick: () => select(id) },
-    place, h("span", { class: "card-line" }, title, status), numbers);
+    place, h("span", { class: "card-text-block" }, h("span", { class: "card-line" }, title, status), numbers));
   return { item: h("li", {}, button), button, status, numbers, frame: new Frame(place, "") };
 }
 
@@ -54,11 +55,11 @@ function updateCard(card, stream) {
   const active = Date.now() / 1000 - pair.received_at_ns / 1e9 < 3;
   card.status.textContent = active ? "live" : ago(pair.received_at_ns);
   card.status.dataset.active = active;
-  const rate = stream.overview?.alarms_per_hour;
-  const told = detection.status === "abstained" ? "not judged" : `${counted(count, "moves", "move")}`;
+  const tracks = new Set(stream.pairs.flatMap((one) => moving(one.detection).map((roi) => roi.track_id)).filter((id) => id !== null)).size;
+  const told = detection.status === "abstained" ? "not judged" : `${count || "nothing"} moving`;
   card.numbers.replaceChildren(
     h("span", { class: count ? "hot" : "" }, told),
     h("span", {}, `${counted(stream.overview?.judged_pairs ?? stream.pairs.length, "pair")}`),
-    rate === null || rate === undefined ? "" : h("span", { title: "regions of motion an hour of judged footage" }, `${Math.round(rate).toLocaleString()}/h`),
+    h("span", {}, counted(tracks, "track")),
   );
 }

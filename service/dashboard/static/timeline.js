@@ -9,6 +9,7 @@ const W = 1000;
 const BARS = 74;
 const LANE = 9;
 const MOST_LANES = 5;
+const LEAST_SLOTS = 40; // a few pairs begin at the left and leave room
 
 let slider, picture, live, told;
 
@@ -40,9 +41,11 @@ function scrubTo(event) {
   const pairs = pairsShown();
   const bounds = picture.getBoundingClientRect();
   const share = (event.clientX - bounds.left) / bounds.width;
-  const at = Math.max(0, Math.min(pairs.length - 1, Math.floor(share * pairs.length)));
+  const at = Math.max(0, Math.min(pairs.length - 1, Math.floor(share * slots(pairs))));
   if (pairs[at]) lookAt(pairs[at].number);
 }
+
+const slots = (pairs) => Math.max(pairs.length, LEAST_SLOTS);
 
 function draw() {
   const pairs = pairsShown();
@@ -51,6 +54,7 @@ function draw() {
   const at = pairs.indexOf(pair);
   slider.max = String(pairs.length - 1);
   slider.value = String(at);
+  slider.style.setProperty("width", `max(48px, ${(100 * pairs.length) / slots(pairs)}%)`);
   const count = moving(pair.detection).length;
   const words = `pair ${at + 1} of ${pairs.length}, ${counted(count, "moving thing")}`;
   slider.setAttribute("aria-valuetext", words);
@@ -62,7 +66,7 @@ function draw() {
 function svgOf(pairs, at) {
   const tracks = tracksOf(pairs).slice(-MOST_LANES);
   const height = BARS + 6 + Math.max(1, tracks.length) * LANE;
-  const step = W / pairs.length;
+  const step = W / slots(pairs);
   const svg = s("svg", { viewBox: `0 0 ${W} ${height}`, preserveAspectRatio: "none", "aria-hidden": "true" });
   svg.append(s("line", { x1: 0, x2: W, y1: BARS, y2: BARS, class: "axis" }));
   svg.append(s("rect", { x: at * step, y: 0, width: Math.max(step, 2), height, class: "cursor" }));
