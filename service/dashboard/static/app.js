@@ -59,6 +59,7 @@ async function refresh() {
 }
 
 async function learnDetector() {
+  if (!(await askJson("/version")).model) return; // still loading; asked again soon
   try {
     [state.detector, { models: state.models }] = await Promise.all([askJson("/detector"), askJson("/models")]);
   } catch (error) {

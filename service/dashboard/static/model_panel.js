@@ -43,7 +43,7 @@ function block(lines) {
 function table(lines) {
   const rows = lines.filter((line) => !/^\|[\s:|-]+\|$/.test(line) || line.replace(/[|\s]/g, "") === "")
     .map((line) => line.replace(/^\||\|\s*$/g, "").split("|").map((cell) => cell.trim())).filter((cells) => cells.some(Boolean));
-  return h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Table of the model card" }, h("table", {}, h("tbody", {}, ...rows.map((cells) => h("tr", {}, ...cells.map((cell) => h("td", {}, ...inline(cell))))))));
+  return h("div", { class: "scroll", tabindex: 0, role: "group", "aria-label": "Table of the model card" }, h("table", {}, h("tbody", {}, ...rows.map((cells) => h("tr", {}, ...cells.map((cell) => h("td", {}, ...inline(cell))))))));
 }
 
 /** `code`, **strong**, and links as their text: addresses in a card lead into a source tree. */
