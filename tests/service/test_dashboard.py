@@ -216,6 +216,7 @@ def test_with_keys_the_page_asks_for_one_and_keeps_it_for_the_tab(browser: Brows
             expect(page.locator(".effect")).to_contain_text("This key may not do that")
             page.reload()
             expect(page.get_by_role("button", name=re.compile("drone7"))).to_be_visible()
+            expect(page.get_by_role("button", name="Change key")).to_be_visible()
             assert keys["read"] not in page.content()
 
 
@@ -277,6 +278,32 @@ def test_narrow_screens_need_no_sideways_scrolling(
             assert page.evaluate("document.documentElement.scrollWidth") <= width, tab
         page.get_by_role("tab", name="Regions").click()
         shot(page, f"width-{width}", tmp_path, whole=True)
+
+
+def test_recorded_events_stand_on_the_timeline(browser: Browser, tmp_path: Path) -> None:
+    """With a store; the events themselves are answered by the test where the service does not offer them."""
+    with real_service(VIFLOW_STORE_URL=str(tmp_path / "detections.db")) as storing, storing.client() as client:
+        feed(client)
+        pairs = client.get("/streams/drone7/pairs").json()["pairs"][::-1]
+        stamps = [pair["detection"]["source_timestamp_ns"] for pair in pairs]
+        thing = {"thing_id": "a-1", "stream_id": "drone7", "track_id": 1, "started_at_ns": stamps[1], "score": 0.9}
+        end = {**thing, "event_id": "2", "kind": "end", "timestamp_ns": stamps[6], "reason": "left", "top_score": 0.97}
+        start = {**thing, "event_id": "1", "kind": "start", "timestamp_ns": stamps[1], "reason": None}
+        with watched_page(browser, storing.address) as page:
+            page.get_by_role("tab", name="Events").click()
+            expect(page.get_by_role("tabpanel")).to_contain_text(re.compile("Stored detections|Recorded events"))
+            described = client.get("/openapi.json").json()
+            described["paths"]["/events"] = {}
+            page.route("**/openapi.json", lambda route: route.fulfill(json=described))
+            page.route("**/events?stream_id=drone7*", lambda route: route.fulfill(json={"events": [end, start]}))
+            page.reload()
+            page.get_by_role("tab", name="Events").click()
+            item = page.get_by_role("button", name=re.compile("Track 1 0.25 s, left 0.97"))
+            item.click()
+            expect(page.locator("#scrub-told")).to_have_text(re.compile("pair 7 of 9"))
+            expect(page.locator(".thing.began")).to_have_count(1)
+            expect(page.locator(".thing.ended")).to_have_count(1)
+            shot(page, "events", tmp_path)
 
 
 def test_what_the_service_says_is_never_taken_for_markup(browser: Browser) -> None:

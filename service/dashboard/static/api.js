@@ -50,6 +50,14 @@ function newKey(problem) {
   return asking;
 }
 
+export const hasKey = () => sessionStorage.getItem(KEY) !== null;
+
+/** Another key: everything is asked for anew with it. */
+export async function changeKey() {
+  await newKey(new Problem(401, "key_missing", ""));
+  location.reload();
+}
+
 function promptForKey(problem) {
   const dialog = document.getElementById("key-dialog");
   const input = document.getElementById("key-input");
@@ -72,7 +80,8 @@ export function inWords(error) {
   if (!(error instanceof Problem)) return String(error.message ?? error);
   const words = {
     unreachable: "The service cannot be reached. Is it running?",
-    scope_missing: "This key may not do that: it takes one of scope detect.",
+    scope_missing: `This key may not do that: ${error.message}.`,
+    rate_limited: "Too many requests for this key's limit; try again in a moment.",
     overloaded: "The service is busy; try again in a moment.",
     pair_not_found: "This pair is no longer remembered by the service.",
     model_loading: "The model is still being loaded.",

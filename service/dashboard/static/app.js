@@ -1,13 +1,14 @@
 // Start: the parts are put into their places, then the service is followed for as long as the page is open.
 
 import { noteMotion, say } from "./announce.js";
-import { askJson, follow, inWords } from "./api.js";
+import { askJson, changeKey, follow, hasKey, inWords } from "./api.js";
 import { byId } from "./dom.js";
 import { showEmpty } from "./empty.js";
-import { addEventsPanel, learnCapabilities } from "./events_panel.js";
+import { addEventsPanel } from "./events_panel.js";
 import { addBudgetPanel } from "./budget_panel.js";
 import { addImuPanel } from "./imu_panel.js";
 import { addModelPanel } from "./model_panel.js";
+import { learnCapabilities } from "./recorded.js";
 import { addRegionsPanel } from "./regions_panel.js";
 import { playSample } from "./sample.js";
 import { addStage } from "./stage.js";
@@ -33,6 +34,7 @@ addStage();
 addTimeline();
 subscribe(showPage);
 byId("open-upload").addEventListener("click", openUpload);
+byId("change-key").addEventListener("click", changeKey);
 byId("play-sample").addEventListener("click", () => playSample());
 
 let everFollowed = false;
@@ -75,6 +77,7 @@ function onState(connection, error) {
   const before = state.connection;
   state.connection = connection;
   const texts = { live: "Live", reconnecting: "Reconnecting", off: "Not available", connecting: "Connecting" };
+  byId("change-key").hidden = !hasKey();
   byId("connection").dataset.state = connection;
   byId("connection-text").textContent = texts[connection];
   const banner = byId("banner");

@@ -1,21 +1,13 @@
-// What moved, as a list: the service's events where it keeps any, else the tracks of the pairs that are remembered.
+// What moved, as a list: what the service has recorded, and the tracks of the pairs that are remembered.
 
-import { ask, askJson, inWords } from "./api.js";
+import { ask, inWords } from "./api.js";
 import { h, onceAFrame } from "./dom.js";
-import { lookAt, pairsShown, state, subscribe } from "./state.js";
+import { hasEvents, hasThumbnails, pairAt, recorded, refreshRecorded } from "./recorded.js";
+import { lookAt, pairsShown, subscribe } from "./state.js";
 import { isOpen } from "./tabs.js";
 import { ago, counted, moving } from "./words.js";
 
-const can = { events: false, thumbnails: false };
-let stored = { of: null, items: null, kind: null };
 const thumbnails = new Map();
-
-/** What this service offers, by its own description. */
-export async function learnCapabilities() {
-  const { paths } = await askJson("/openapi.json");
-  can.events = "/events" in paths;
-  can.thumbnails = "/detections/{detection_id}/thumbnail" in paths;
-}
 
 /** Things that moved through these pairs, by the first place where they did. */
 export function tracksOf(pairs) {
@@ -37,12 +29,13 @@ export function addEventsPanel(panel) {
   const now = h("ul", { class: "plain-list" });
   const before = h("div", {});
   panel.append(h("h3", {}, "Things that moved"), now, before);
+  subscribe((what) => { if (["selected", "detector", "overview"].includes(what)) refreshRecorded(); });
   subscribe(onceAFrame(() => {
     if (!isOpen("events")) return;
     const tracks = tracksOf(pairsShown()).reverse();
     now.replaceChildren(...tracks.slice(0, 40).map(trackItem));
     if (!tracks.length) now.replaceChildren(h("li", { class: "quiet-note" }, "Nothing has moved by itself in the pairs that are remembered."));
-    drawStored(before);
+    before.replaceChildren(...recordedItems());
   }));
 }
 
@@ -54,35 +47,31 @@ function trackItem(track) {
     h("span", { class: "score" }, track.score.toFixed(2))));
 }
 
-async function drawStored(place) {
-  const wanted = state.selected;
-  const hasStore = pairsShown().some((pair) => pair.detection_id);
-  if (stored.of === wanted || (!can.events && !hasStore)) return;
-  stored = { of: wanted, items: null };
-  const name = encodeURIComponent(wanted);
-  try {
-    const answer = can.events ? await askJson(`/events?stream=${name}&limit=50`) : await askJson(`/detections?stream=${name}&label=independent_motion&limit=50`);
-    const items = can.events ? (answer.events ?? []).map(eventItem) : answer.detections.map(storedItem);
-    place.replaceChildren(h("h3", {}, can.events ? "Recorded events" : "Stored detections"), h("ul", { class: "plain-list" }, items.length ? items : h("li", { class: "quiet-note" }, "None yet.")));
-  } catch (error) {
-    place.replaceChildren(h("p", { class: "quiet-note" }, inWords(error)));
-  }
+function recordedItems() {
+  const { of, things, error } = recorded();
+  if (of === null) return [];
+  const head = h("h3", {}, hasEvents() ? "Recorded events" : "Stored detections");
+  if (error) return [head, h("p", { class: "quiet-note" }, inWords(error))];
+  if (!things.length) return [head, h("p", { class: "quiet-note" }, "None yet.")];
+  return [head, h("ul", { class: "plain-list" }, ...things.map(thingItem))];
 }
 
-const eventItem = (event) => h("li", { class: "list-row" }, h("strong", {}, `${event.kind} `),
-  h("span", { class: "grow muted" }, `track ${event.track_id ?? "none"} at ${(event.timestamp_ns / 1e9).toFixed(2)} s`),
-  h("span", { class: "score" }, Number(event.score ?? 0).toFixed(2)));
-
-function storedItem(one) {
-  const best = Math.max(...moving(one.detection).map((roi) => roi.score));
-  return h("li", { class: "list-row" }, thumbnailOf(one.id), h("span", { class: "grow" }, counted(moving(one.detection).length, "moving thing"),
-    h("span", { class: "muted" }, ` ${ago(one.stored_at_ns)}`)), h("span", { class: "score" }, best.toFixed(2)));
+function thingItem(thing) {
+  const pairs = pairsShown();
+  const at = pairAt(pairs, thing.at_ns);
+  const seconds = thing.to_ns === null ? "still there" : `${((thing.to_ns - thing.from_ns) / 1e9).toFixed(2)} s`;
+  const content = [thumbnailOf(thing.detection_id), h("span", { class: "grow" }, h("strong", {}, thing.title),
+    h("span", { class: "muted" }, ` ${thing.to_ns === thing.from_ns ? "" : seconds}${thing.ended ? `, ${thing.ended.replaceAll("_", " ")}` : ""}`)),
+  h("span", { class: "score" }, thing.score.toFixed(2))];
+  if (at < 0) return h("li", { class: "list-row" }, ...content);
+  return h("li", {}, h("button", { type: "button", class: "list-button", onclick: () => lookAt(pairs[at].number) }, ...content));
 }
 
 function thumbnailOf(id) {
-  if (!can.thumbnails || !id) return null;
+  if (!hasThumbnails() || !id) return null;
   const image = h("img", { class: "thumbnail", alt: "", hidden: true });
-  if (!thumbnails.has(id)) thumbnails.set(id, ask(`/detections/${id}/thumbnail`).then((r) => r.blob()).then((b) => URL.createObjectURL(b), () => null));
+  if (thumbnails.size > 400) thumbnails.clear();
+  if (!thumbnails.has(id)) thumbnails.set(id, ask(`/detections/${id}/thumbnail`).then((r) => r.blob()).then((b) => URL.createObjectURL(b)).catch(() => null));
   thumbnails.get(id).then((url) => { if (url) { image.src = url; image.hidden = false; } });
   return image;
 }

@@ -7,7 +7,8 @@ const byWeight = (a, b) => (a.label === b.label ? a.score - b.score : a.label ==
 
 /** Keeps one frame up to date; the newest wanted picture wins, and one is fetched at a time. */
 export class Frame {
-  constructor(place, label) {
+  constructor(place, label, rest = 80) {
+    this.rest = rest; // ms between two pictures: a viewer must not keep the service busy
     this.image = h("img", { alt: label, decoding: "async" });
     this.overlay = h("div", { class: "overlay" });
     this.note = h("p", { class: "frame-note", hidden: true });
@@ -20,7 +21,8 @@ export class Frame {
   /** load(): a promise of an address. */
   want(key, load, size) {
     if (size) this.place.style.setProperty("--ratio", `${size.width} / ${size.height}`);
-    if (key === this.shown || key === this.loading) return;
+    if (key === this.shown || key === this.loading || document.hidden) return;
+    if (key === this.failed && Date.now() < this.again) return;
     this.next = { key, load };
     this.pump();
   }
@@ -39,11 +41,14 @@ export class Frame {
       this.note.hidden = true;
     } catch (error) {
       this.say(error.words ?? "This picture cannot be shown.");
+      [this.failed, this.again] = [key, Date.now() + 5000];
     }
     this.loading = null;
     this.place.removeAttribute("aria-busy");
-    this.busy = false;
-    this.pump();
+    setTimeout(() => {
+      this.busy = false;
+      this.pump();
+    }, this.rest);
   }
 
   say(text) {

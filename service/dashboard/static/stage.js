@@ -19,7 +19,7 @@ const MAP_LEGENDS = {
 
 export function addStage() {
   frame = new Frame(byId("picture"), "");
-  map = new Frame(byId("map"), "");
+  map = new Frame(byId("map"), "", 350);
   byId("legend").append(
     h("span", {}, labelSwatch("independent_motion"), " independent motion"),
     h("span", {}, labelSwatch("model_error"), " model error"),
@@ -106,6 +106,6 @@ async function lookClosely(pair) {
   } catch (error) {
     state.inspection = { number: pair.number, error: inWords(error) };
   }
-  setTimeout(() => { asked = null; changed("inspection"); }, 60);
+  setTimeout(() => { asked = null; changed("inspection"); }, state.cursor === null ? 400 : 60);
 }
 

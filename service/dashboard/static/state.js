@@ -50,6 +50,7 @@ export function replaceStreams(listed) {
     stream.overview = overview;
     if (pairs) stream.pairs = pairs.slice(-MOST_PAIRS);
   }
+  if (!pairsShown().some((pair) => pair.number === state.cursor)) state.cursor = null;
   if (!state.streams.has(state.selected)) select([...state.streams.keys()][0] ?? null);
   changed("pairs");
 }

@@ -2,6 +2,7 @@
 
 import { byId, h, onceAFrame, s } from "./dom.js";
 import { tracksOf } from "./events_panel.js";
+import { pairAt, recorded } from "./recorded.js";
 import { currentPair, lookAt, pairsShown, state, subscribe } from "./state.js";
 import { counted, moving } from "./words.js";
 
@@ -75,7 +76,15 @@ function svgOf(pairs, at) {
     const y = BARS + 6 + lane * LANE;
     svg.append(s("rect", { x: track.first * step, y, width: Math.max((track.last - track.first + 1) * step - 1, 3), height: LANE - 3, rx: 2, class: "lane" }));
   });
+  for (const thing of recorded().things) svg.append(...thingMarks(pairs, thing, step));
   return svg;
+}
+
+/** A full triangle where a recorded thing began, an open one where it ended. */
+function thingMarks(pairs, thing, step) {
+  return [[thing.from_ns, "began"], [thing.to_ns, "ended"]].filter(([ns, kind]) => ns !== null && (kind === "began" || thing.to_ns !== thing.from_ns))
+    .map(([ns, kind]) => [pairAt(pairs, ns), kind]).filter(([at]) => at >= 0)
+    .map(([at, kind]) => s("path", { d: `M${at * step} 0h12l-6 9z`, class: `thing ${kind}` }));
 }
 
 function mark(pair, x, step) {

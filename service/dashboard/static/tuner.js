@@ -23,6 +23,7 @@ const RULES = { axis_aligned: "sides of the box (the paper's)", oriented: "sides
 const controls = new Map();
 let options = {};
 let result = null;
+let failed = null; // {number, error}: not asked again for the same pair until a setting changes
 let trial = { after: [], running: false };
 let controller = null;
 let timer = null;
@@ -39,7 +40,7 @@ export function addTuner(panel) {
   const draw = onceAFrame(() => {
     if (!isOpen("tuner") || !state.detector) return;
     const pair = currentPair();
-    if (Object.keys(options).length && pair && state.cursor !== null && state.tuned?.number !== pair.number) schedule();
+    if (Object.keys(options).length && pair && state.cursor !== null && state.tuned?.number !== pair.number && failed?.number !== pair.number) schedule();
     drawEffect();
   });
   subscribe(draw);
@@ -90,6 +91,7 @@ function reset() {
 }
 
 function schedule() {
+  failed = null;
   clearTimeout(timer);
   timer = setTimeout(run, DEBOUNCE_MS);
 }
@@ -118,9 +120,7 @@ async function run() {
     }
   } catch (error) {
     if (error.name === "AbortError") return;
-    effect.replaceChildren(h("p", { class: "error" }, inWords(error)));
-    trial.running = false;
-    return;
+    failed = { number: pair.number, error };
   }
   trial.running = false;
   drawEffect();
@@ -138,6 +138,10 @@ function withTracks(detection, before) {
 function drawEffect() {
   const pair = currentPair();
   output.hidden = !result;
+  if (failed) {
+    effect.replaceChildren(h("p", { class: "error" }, inWords(failed.error)));
+    return;
+  }
   if (!result || !pair) {
     effect.replaceChildren(h("p", { class: "quiet-note" }, "Move a slider: the picture shows at once what would change."));
     return;
