@@ -10,6 +10,10 @@ REQUIRED = (
     "viflow_anomaly/py.typed",
     "viflow_anomaly/schemas/detection-1.0.schema.json",
     "viflow_anomaly/cli/main.py",
+    "viflow_anomaly_service/dashboard/sample/9.jpg",
+    "viflow_anomaly_service/dashboard/sample/recording.json",
+    "viflow_anomaly_service/dashboard/static/app.js",
+    "viflow_anomaly_service/dashboard/static/index.html",
     "viflow_anomaly_service/server.py",
     "viflow_anomaly_service/store/migrations/versions/v0001_detections.py",
 )

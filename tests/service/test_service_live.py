@@ -12,7 +12,7 @@ import cv2
 import httpx
 import numpy as np
 import pytest
-from looking_on import feed, sample_pair
+from looking_on import SAMPLE, feed, sample_pair
 from rule_detector import RuleDetector
 from service_world import LiveServer, assert_problem, form_request, live_server
 
@@ -203,6 +203,17 @@ def test_the_detector_is_described(real: LiveServer) -> None:
     assert told["region_settings"]["motion_score"]["minimum"] == 0.5
     assert told["calibration"] is None
     assert {card["name"] for card in told["cards"]} == {"viflow-calibrated", "viflow-evidence"}
+
+
+def test_the_recording_that_the_page_plays_is_the_bundled_sample() -> None:
+    frames = sorted((SAMPLE.parents[2] / "samples" / "drone" / "mav0" / "cam0" / "data").glob("*.png"))
+    told = json.loads((SAMPLE / "recording.json").read_text(encoding="utf-8"))
+    assert told["frames_ns"] == [int(frame.stem) - int(frames[0].stem) for frame in frames]
+    for number, frame in enumerate(frames):
+        ours, theirs = (cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in (SAMPLE / f"{number}.jpg", frame))
+        assert ours is not None
+        assert theirs is not None
+        assert np.abs(ours.astype(np.float32) - theirs).mean() < 4
 
 
 def test_memory_is_bounded_in_pairs_and_bytes(detector: AnomalyDetector) -> None:
