@@ -62,10 +62,10 @@ export class Frame {
 }
 
 /** Boxes: motion solid and thick, model error thin and dashed, what the tuner took away dotted. */
-export function regionsSvg(detection, { chosen = null, ghosts = [], arrows = [], labels = true, onChoose = null } = {}) {
+export function regionsSvg(detection, { chosen = null, ghosts = [], arrows = [], labels = true, fit = "none", onChoose = null } = {}) {
   const { width, height } = detection.image;
-  const unit = width / 100;
-  const svg = s("svg", { viewBox: `0 0 ${width} ${height}`, preserveAspectRatio: "none", "aria-hidden": "true" });
+  const unit = Math.min(width, height * 1.6) / 100;
+  const svg = s("svg", { viewBox: `0 0 ${width} ${height}`, preserveAspectRatio: fit, "aria-hidden": "true" });
   for (const [x, y, du, dv] of arrows) svg.append(...arrow(x, y, du, dv, unit));
   for (const ghost of ghosts) svg.append(box(ghost, "ghost"));
   for (const roi of [...detection.rois].sort(byWeight)) {

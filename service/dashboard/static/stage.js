@@ -11,6 +11,7 @@ let frame = null;
 let map = null;
 let asked = null;
 
+const WIDE = 2; // pictures wider than this times their height lie below each other
 const MAP_LEGENDS = {
   residual: ["inferno", "0", "80+ gray levels", "What the rebuilt picture gets wrong. Bright is unexplained."],
   evidence: ["viridis", "0", "1", "Probability that a pixel belongs to something that moves by itself."],
@@ -42,6 +43,7 @@ function draw() {
   const pair = currentPair();
   if (!pair) return;
   const detection = currentDetection();
+  byId("picture").closest(".panes").classList.toggle("wide", detection.image.width > WIDE * detection.image.height);
   byId("stage-title").textContent = nameOfStream(pair.stream_id);
   byId("stage-note").replaceChildren(...noteOf(pair, detection));
   drawPicture(pair, detection);

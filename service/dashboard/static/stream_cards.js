@@ -50,16 +50,16 @@ function updateCard(card, stream) {
   const { detection } = pair;
   const count = moving(detection).length;
   card.button.setAttribute("aria-pressed", String(state.selected === stream.id));
-  card.frame.want(pair.number, () => picture(pair, "source").catch((error) => { error.words = inWords(error); throw error; }), detection.image);
-  card.frame.draw(regionsSvg(detection, { labels: false }));
+  card.frame.want(pair.number, () => picture(pair, "source").catch((error) => { error.words = inWords(error); throw error; }));
+  card.frame.draw(regionsSvg(detection, { labels: false, fit: "xMidYMid meet" }));
   const active = Date.now() / 1000 - pair.received_at_ns / 1e9 < 3;
   card.status.textContent = active ? "live" : ago(pair.received_at_ns);
   card.status.dataset.active = active;
   const tracks = new Set(stream.pairs.flatMap((one) => moving(one.detection).map((roi) => roi.track_id)).filter((id) => id !== null)).size;
-  const told = detection.status === "abstained" ? "not judged" : `${count || "nothing"} moving`;
+  const told = detection.status === "abstained" ? "not judged" : (count ? `${count} moving` : "no motion");
   card.numbers.replaceChildren(
     h("span", { class: count ? "hot" : "" }, told),
     h("span", {}, `${counted(stream.overview?.judged_pairs ?? stream.pairs.length, "pair")}`),
-    h("span", {}, counted(tracks, "track")),
+    tracks ? h("span", {}, counted(tracks, "track")) : "",
   );
 }
