@@ -41,9 +41,20 @@ def test_the_winner_has_the_smallest_error_and_the_correction_a_smaller_one(
     analysis = detector.analyze(pair)
     view = view_hypotheses(analysis.predicted, analysis.model_input)
     assert len(view.errors) == 8
-    assert view.winner == analysis.predicted.hypothesis == int(np.argmin(view.errors))
+    errors = [error for error in view.errors if error is not None]
+    assert view.winner == analysis.predicted.hypothesis == int(np.argmin(errors))
     assert view.corrected_error is not None
-    assert view.corrected_error < min(view.errors)
+    assert view.corrected_error < min(errors)
+
+
+def test_numbers_that_are_none_are_left_out(detector: AnomalyDetector, pair: FramePair) -> None:
+    analysis = detector.analyze(pair)
+    damaged = analysis.predicted._replace(hypotheses_px=np.full_like(analysis.predicted.hypotheses_px, np.nan))
+    assert view_hypotheses(damaged, analysis.model_input).errors[0] is not None  # what leaves the picture costs nothing
+    correction = analysis.predicted.correction
+    assert correction is not None
+    unknown = analysis.predicted._replace(correction=correction._replace(turned_rad=np.nan))
+    assert pair_signs(pair, unknown).turn_error_rad_s is None
 
 
 def test_without_a_correction_there_is_nothing_to_say_of_it(detector: AnomalyDetector, pair: FramePair) -> None:

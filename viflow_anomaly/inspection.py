@@ -13,18 +13,19 @@ from viflow_anomaly.prediction import PredictedFlow, reconstruction_errors
 from viflow_anomaly.sensor_data import FramePair
 
 ARROWS_ACROSS = 24
+ERROR_DECIMALS = 6
 
 
 class HypothesesView(NamedTuple):
     """How well each hypothesis rebuilds the source, as the choice among them saw it; smaller is better.
 
     Attributes:
-        errors: [K] of the network's hypotheses.
+        errors: [K] of the network's hypotheses; None for one that is not finite.
         winner: index of the chosen one.
-        corrected_error: of the flow after the correction, None with correction off.
+        corrected_error: of the flow after the correction, None likewise and with correction off.
     """
 
-    errors: tuple[float, ...]
+    errors: tuple[float | None, ...]
     winner: int
     corrected_error: float | None
 
@@ -60,8 +61,10 @@ def view_hypotheses(predicted: PredictedFlow, model_input: ModelInput) -> Hypoth
     errors = reconstruction_errors(predicted.hypotheses_px, predicted.stride, *images)
     corrected = None
     if predicted.correction is not None:
-        corrected = float(reconstruction_errors(predicted.flow_px[None], predicted.stride, *images)[0])
-    return HypothesesView(tuple(float(error) for error in errors), predicted.hypothesis, corrected)
+        corrected = _finite(
+            reconstruction_errors(predicted.flow_px[None], predicted.stride, *images)[0], ERROR_DECIMALS
+        )
+    return HypothesesView(tuple(_finite(one, ERROR_DECIMALS) for one in errors), predicted.hypothesis, corrected)
 
 
 def flow_arrows(flow_px: Float32Array, inside: NDArray[np.bool_]) -> list[FlowArrow]:
@@ -88,4 +91,9 @@ def pair_signs(pair: FramePair, predicted: PredictedFlow | None) -> PairSigns:
     if correction is None:
         return PairSigns(rate, gap, None, None)
     turn = correction.turned_rad / (pair.interval_ns * 1e-9)
-    return PairSigns(rate, gap, round(correction.inlier_share, 4), round(turn, 5))
+    return PairSigns(rate, gap, _finite(correction.inlier_share, 4), _finite(turn, 5))
+
+
+def _finite(value: float, decimals: int) -> float | None:
+    """A damaged network's numbers may be none."""
+    return round(float(value), decimals) if np.isfinite(value) else None

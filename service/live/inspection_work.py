@@ -39,7 +39,6 @@ class InspectionWork:
         remembered: the pair.
         body: of the request.
         settings: limits.
-        current: the configuration that changes are told against; the one it was judged under.
     """
 
     def __init__(self, remembered: RememberedPair, body: bytes, settings: ServiceSettings) -> None:
@@ -57,7 +56,10 @@ class InspectionWork:
         detector = self._judged.detector
         config = wanted_config(request.options, detector.config)
         job.require_wanted()
-        members, _ = inspect_pair(detector, self._judged.pair, config, view=request.view)
+        try:
+            members, _ = inspect_pair(detector, self._judged.pair, config, view=request.view)
+        except ViflowError as err:
+            raise problem_of_error(err) from err
         return json_object({**members, **described_changes(detector.config, config)})
 
 

@@ -76,7 +76,11 @@ _INSPECTED: Final[JsonObject] = {
     "signs": reference("PairSigns"),
     "hypotheses": closed_object(
         {
-            "errors": {"type": "array", "items": _NUMBER, "description": "of the rebuilt source, smaller is better"},
+            "errors": {
+                "type": "array",
+                "items": _NUMBER_OR_NULL,
+                "description": "of the rebuilt source, smaller is better",
+            },
             "winner": {**_COUNT, "description": "index of the chosen one"},
             "corrected_error": {**_NUMBER_OR_NULL, "description": "of the flow after the correction"},
         }

@@ -16,6 +16,10 @@ from looking_on import SAMPLE, feed, sample_pair
 from rule_detector import RuleDetector
 from service_world import LiveServer, assert_problem, form_request, live_server
 
+from viflow_anomaly.alarm_calibration import make_calibration, write_calibration
+from viflow_anomaly.alarm_footage import JudgedPair as AlarmFootage
+from viflow_anomaly.alarm_footage import WatchedRecording, footage_of
+from viflow_anomaly.detection import ModelInfo
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.settings import Settings, resolve_settings
 from viflow_anomaly_service.api_keys import new_key
@@ -203,6 +207,28 @@ def test_the_detector_is_described(real: LiveServer) -> None:
     assert told["region_settings"]["motion_score"]["minimum"] == 0.5
     assert told["calibration"] is None
     assert {card["name"] for card in told["cards"]} == {"viflow-calibrated", "viflow-evidence"}
+
+
+def test_the_detector_is_described_with_what_its_calibration_promises(tmp_path: Path) -> None:
+    calm = WatchedRecording("hall", None, (AlarmFootage(0.5, ()),) * 800, abstained=0, failed={})
+    made = make_calibration(
+        [calm],
+        footage_of([calm]),
+        model=ModelInfo("rule", "1", "ab" * 32),
+        execution=RuleDetector().execution,
+        detector=RuleDetector().config,
+        budget_per_hour=30.0,
+        confidence=0.95,
+        block_s=10.0,
+    )
+    path = tmp_path / "hall.json"
+    write_calibration(path, made)
+    with live_server(lambda settings: RuleDetector(), calibration=path) as server:
+        told = server.client.get("/detector").json()["calibration"]
+        assert (told["budget_per_hour"], told["promised"], told["recordings"]) == (30.0, True, ["hall"])
+        assert told["motion_score"] == made.motion_score
+        path.unlink()
+        assert server.client.get("/detector").json()["calibration"] is None
 
 
 def test_the_recording_that_the_page_plays_is_the_bundled_sample() -> None:

@@ -105,15 +105,15 @@ function hypothesesOf(look) {
   if (look?.error) return [h("p", { class: "quiet-note" }, look.error)];
   if (!look?.hypotheses) return [h("p", { class: "quiet-note" }, "Stop at a pair (arrow keys on the timeline) to see the network's hypotheses.")];
   const { errors, winner, corrected_error: corrected } = look.hypotheses;
-  const most = Math.max(...errors, corrected ?? 0);
+  const most = Math.max(...errors.map((error) => error ?? 0), corrected ?? 0) || 1;
   const bars = errors.map((error, index) => [`${index + 1}`, error, index === winner ? "won" : ""]);
   if (corrected !== null) bars.push(["corrected", corrected, "after"]);
   const told = `${counted(errors.length, "guess", "guesses")} of the camera's motion: number ${winner + 1} rebuilds the frame best` + (corrected === null ? "." : `, and the correction on the target image goes on from it.`);
   return [h("h3", {}, "Hypotheses"), h("p", { class: "muted" }, told),
     h("ul", { class: "bars", "aria-label": "Error of each hypothesis, smaller is better" }, ...bars.map(([name, error, kind]) => {
       const bar = h("span", { class: "bar-fill", "aria-hidden": "true" });
-      bar.style.setProperty("--share", String(error / most));
-      return h("li", { class: kind }, h("span", { class: "bar-name" }, name, kind === "won" ? h("span", { class: "chip" }, "won") : null), h("span", { class: "bar-room" }, bar), h("span", { class: "score" }, error.toFixed(3)));
+      bar.style.setProperty("--share", String((error ?? 0) / most));
+      return h("li", { class: kind }, h("span", { class: "bar-name" }, name, kind === "won" ? h("span", { class: "chip" }, "won") : null), h("span", { class: "bar-room" }, bar), h("span", { class: "score" }, number(error, 3)));
     }))];
 }
 

@@ -73,9 +73,7 @@ function slider(name, [label, least, most, step], value) {
 }
 
 function set(name, value) {
-  const before = state.detector.configuration.regions[name];
-  if (value === before) delete options[name];
-  else options[name] = value;
+  options[name] = value; // the stream may have options of its own: the service says what differs
   const pair = currentPair();
   if (pair) state.cursor = pair.number; // what is tuned holds still
   schedule();
@@ -137,7 +135,7 @@ function withTracks(detection, before) {
 
 function drawEffect() {
   const pair = currentPair();
-  output.hidden = !result;
+  output.hidden = !result?.configuration.toml;
   if (failed) {
     effect.replaceChildren(h("p", { class: "error" }, inWords(failed.error)));
     return;
