@@ -15,11 +15,11 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from viflow_anomaly_service.access_rules import (
-    OPEN_PATHS,
     SAFE_METHODS,
     is_direct_from_here,
     is_foreign_page,
     is_loopback,
+    is_open,
     required_scope,
 )
 from viflow_anomaly_service.api_keys import ApiKey, KeyRing
@@ -70,7 +70,7 @@ class AccessMiddleware:
         self._limiter = RateLimiter(time.time)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] not in ("http", "websocket") or scope["path"] in OPEN_PATHS:
+        if scope["type"] not in ("http", "websocket") or is_open(scope["path"]):
             await self.app(scope, receive, send)
             return
         try:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from viflow_anomaly_service.access_control import KEY_HEADER
-from viflow_anomaly_service.access_rules import OPEN_PATHS, required_scope
+from viflow_anomaly_service.access_rules import is_open, required_scope
 
 SECURITY_SCHEMES: Final = {
     "bearerKey": {"type": "http", "scheme": "bearer", "description": "a key of `viflow-anomaly keys new`"},
@@ -25,7 +25,7 @@ def describe_access(document: dict[str, Any], refusals: Mapping[int | str, Any])
     document.setdefault("components", {})["securitySchemes"] = SECURITY_SCHEMES
     for path, item in document["paths"].items():
         for method, operation in item.items():
-            if path in OPEN_PATHS:
+            if is_open(path):
                 operation["security"] = []
                 continue
             scope = required_scope(method.upper(), path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import re
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 from urllib.parse import urlsplit
@@ -12,6 +13,9 @@ from viflow_anomaly_service.api_keys import Scope
 from viflow_anomaly_service.settings import ServiceSettings
 
 OPEN_PATHS: Final = frozenset({"/healthz", "/readyz"})
+_PAGE_FILES: Final = "/dashboard/"
+_LOOKING_ON: Final = re.compile(r"/streams/[^/]+/(live|pairs|pairs/[^/]+/[^/]+)")
+"""What shows a stream to who may read; the rest below ``/streams`` is for who brings frames."""
 SAFE_METHODS: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 _FORWARDED: Final = ("forwarded", "x-forwarded-for", "x-real-ip")
 
@@ -36,12 +40,20 @@ _RULES: Final = (
     _Rule(None, "/streams", "detect"),
     _Rule(_POSTING, "/detect", "detect"),
     _Rule(None, "/events/deliveries", "admin"),
+    _Rule(_POSTING, "/inspect", "detect"),
     _Rule(_READING, "/", "read"),
 )
 
 
+def is_open(path: str) -> bool:
+    """Whether everybody may ask: probes, and the dashboard's files, which hold no data."""
+    return path in OPEN_PATHS or path == "/" or path.startswith(_PAGE_FILES)
+
+
 def required_scope(method: str, path: str) -> Scope | None:
     """The scope that a request needs, or None where any key will do."""
+    if method in _READING and _LOOKING_ON.fullmatch(path):
+        return "read"
     for rule in _RULES:
         inside = rule.prefix in ("/", path) or path.startswith(rule.prefix + "/")
         if inside and (rule.methods is None or method in rule.methods):

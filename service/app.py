@@ -13,11 +13,14 @@ from fastapi import FastAPI
 from viflow_anomaly.pair_detector import PairDetector
 from viflow_anomaly_service.access_control import add_access_control
 from viflow_anomaly_service.admission import AdmissionGate
+from viflow_anomaly_service.dashboard.static_files import add_dashboard
 from viflow_anomaly_service.detect_endpoint import add_detect
 from viflow_anomaly_service.detector_loading import DetectorLoader, load_bundled_or_configured, warm_up
 from viflow_anomaly_service.detector_pool import DetectorPool
 from viflow_anomaly_service.events.attach import configured_events
 from viflow_anomaly_service.events.endpoints import add_events
+from viflow_anomaly_service.live.endpoints import add_live
+from viflow_anomaly_service.live.pair_memory import PairMemory
 from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.models.endpoints import add_models
 from viflow_anomaly_service.models.table import ModelTable
@@ -94,6 +97,9 @@ def create_app(
     add_detections(app, core)
     add_streams(app, core)
     add_events(app, core)
+    add_live(app, core)
+    if core.settings.dashboard:
+        add_dashboard(app)
     return app
 
 
@@ -123,6 +129,7 @@ def _build(
         keeper=keeper,
         streams=StreamTable(settings, gate, metrics, on_forget=events.desk.end),
         events=events,
+        live=PairMemory(settings, metrics),
     )
 
 

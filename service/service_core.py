@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from viflow_anomaly_service.admission import AdmissionGate
 from viflow_anomaly_service.detector_pool import DetectorPool
 from viflow_anomaly_service.events.attach import EventParts
+from viflow_anomaly_service.live.pair_memory import PairMemory
 from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.models.table import ModelTable
 from viflow_anomaly_service.settings import ServiceSettings
@@ -30,6 +31,7 @@ class ServiceCore:
         keeper: where detections stay; None: nowhere.
         streams: what is remembered between frames.
         events: what is told of what moves.
+        live: the pairs that were judged a moment ago.
     """
 
     settings: ServiceSettings
@@ -40,3 +42,4 @@ class ServiceCore:
     keeper: ResultKeeper | None
     streams: StreamTable
     events: EventParts
+    live: PairMemory

@@ -173,6 +173,9 @@ class ServiceSettings(BaseSettings):
     mqtt_prefix: Topic = Field(default="viflow", description="ahead of all topics of this service, and of no other")
     mqtt_discovery_prefix: Topic = Field(default="homeassistant", description="where Home Assistant looks")
     mqtt_ca_file: UsablePath | None = Field(default=None, description="whom mqtts:// trusts; not given: as the system")
+    live_pairs: NonNegativeInt = Field(default=120, description="recent pairs of a stream to look at; 0: none")
+    live_bytes: PositiveInt = Field(default=256 * MEBIBYTE, description="of all recent pairs together")
+    dashboard: bool = Field(default=True, description="the page at /")
     log_level: Literal["debug", "info", "warning", "error"] = "info"
 
     @model_validator(mode="after")

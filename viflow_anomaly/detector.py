@@ -26,7 +26,7 @@ from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.evidence_cues import EvidenceCues, evidence_cues
 from viflow_anomaly.explanation import Explanation, explain
 from viflow_anomaly.geometry import Float32Array, pixel_grid
-from viflow_anomaly.model_input import prepare
+from viflow_anomaly.model_input import ModelInput, prepare
 from viflow_anomaly.motion_evidence import JudgedCues, judge_cues, regions_of, require_our_cues, takes_head
 from viflow_anomaly.motion_input import MotionWindow
 from viflow_anomaly.pair_detector import Execution, LoadedWeights
@@ -69,6 +69,7 @@ class Analysis(NamedTuple):
         target_coordinates: [H, W, 2] float32 where each source pixel is predicted in the target image.
         predicted: the flow they come from, in the network's view, and its correction.
         learned: this is a pair for the evidence head, so that ``evidence`` are probabilities.
+        model_input: how the network saw the pair.
     """
 
     detection: Detection
@@ -79,6 +80,7 @@ class Analysis(NamedTuple):
     target_coordinates: Float32Array
     predicted: PredictedFlow
     learned: bool
+    model_input: ModelInput
 
     @property
     def flow_px(self) -> Float32Array:
@@ -263,7 +265,7 @@ class AnomalyDetector:
         nothing = np.zeros_like(residual) if learned else explained.normalised
         evidence = nothing if judged is None else judged.maps.motion
         maps = (residual, evidence, explained.inside, explained.reconstruction, explained.target_coordinates)
-        return Analysis(detection, *maps, explained.predicted, learned=learned)
+        return Analysis(detection, *maps, explained.predicted, learned=learned, model_input=explained.model_input)
 
     def _findings(self, pair: FramePair, explained: Explanation, *, shares_scene: bool) -> tuple[Finding, ...]:
         """What can be said against the pair, and whether it can be judged at all."""

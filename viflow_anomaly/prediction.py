@@ -98,9 +98,13 @@ def choose_hypothesis(hypotheses: Hypotheses, source: Uint8Array, target: Uint8A
 
     A pixel whose prediction leaves the target costs what it would had nothing moved, so leaving never pays.
     """
-    flow_px, stride = hypotheses.flow_px, hypotheses.stride
-    if len(flow_px) == 1:
+    if len(hypotheses.flow_px) == 1:
         return 0
+    return int(np.argmin(reconstruction_errors(hypotheses.flow_px, hypotheses.stride, source, target)))
+
+
+def reconstruction_errors(flow_px: Float32Array, stride: int, source: Uint8Array, target: Uint8Array) -> Float32Array:
+    """[K] mean error of the source rebuilt by each of the flows [K, h, w, 2], on cells of ``stride`` view pixels."""
     shrink = max(stride, SELECTION_STRIDE_PX)
     size = (source.shape[1] // shrink, source.shape[0] // shrink)
     small_source, small_target = (_normalised(image, size, shrink) for image in (source, target))
@@ -111,7 +115,7 @@ def choose_hypothesis(hypotheses: Hypotheses, source: Uint8Array, target: Uint8A
     sampled = sample_bilinear(small_target, tall).reshape(at.shape[:3])
     difference = np.where(inside, sampled, small_target) - small_source
     errors = np.sqrt(difference * difference + np.float32(CHARBONNIER_EPSILON**2)).mean(axis=(1, 2))
-    return int(np.argmin(errors))
+    return np.asarray(errors, dtype=np.float32)
 
 
 def _normalised(image: Uint8Array, size: tuple[int, int], shrink: int) -> Float32Array:

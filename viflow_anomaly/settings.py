@@ -87,6 +87,9 @@ SERVICE_SETTINGS = (
     "mqtt_prefix",
     "mqtt_discovery_prefix",
     "mqtt_ca_file",
+    "live_pairs",
+    "live_bytes",
+    "dashboard",
     "log_level",
 )
 """What the service alone takes and checks. It is built on the library, which cannot ask it; a test compares the two."""

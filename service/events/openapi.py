@@ -133,7 +133,7 @@ _WRONG: Final[Fault] = ("parameter_invalid", "kind: expected start or update or 
 _FULL: Final[Fault] = ("event_readers_full", "expected at most 64 readers of events at once, found one more", None)
 _UNKNOWN: Final[Fault] = ("delivery_not_found", "expected the id of a delivery, found '17'", None)
 _NOT_DEAD: Final[Fault] = ("delivery_not_dead", "expected a delivery that is dead, found one that is pending", None)
-_STREAM: Final = parameter("stream_id", STREAM_ID, "events of this stream")
+_STREAM: Final = parameter("stream", STREAM_ID, "events of this stream")
 _FILTERS: Final = [
     _STREAM,
     parameter("kind", {"type": "string", "enum": list(KINDS)}, "of this kind"),

@@ -24,7 +24,7 @@ from viflow_anomaly_service.store.query import (
 )
 
 KINDS: Final[tuple[str, ...]] = get_args(EventKind)
-EVENT_FILTER_NAMES: Final = ("stream_id", "kind", "from_ns", "to_ns", "order")
+EVENT_FILTER_NAMES: Final = ("stream", "kind", "from_ns", "to_ns", "order")
 DELIVERY_STATES: Final = ("pending", "delivered", "dead")
 DELIVERY_ID: Final = re.compile(r"(?P<event>[0-9a-f]{32})\.(?P<sink>mqtt|webhook-[0-9a-f]{12})", re.ASCII)
 EVENT_ID: Final = DETECTION_ID
@@ -111,7 +111,7 @@ def read_live_stream(parameters: list[tuple[str, str]]) -> str | None:
     Raises:
         Problem: 422 with the parameter at fault.
     """
-    return stream_parameter(parameters_once(parameters, ("stream_id",)), "stream_id")
+    return stream_parameter(parameters_once(parameters, ("stream",)), "stream")
 
 
 def read_last_event_id(text: str | None) -> str | None:
@@ -146,7 +146,7 @@ def delivery_not_found(text: str) -> Problem:
 def _filter(given: dict[str, str]) -> EventFilter:
     from_ns, to_ns = time_parameters(given)
     return EventFilter(
-        stream_id=stream_parameter(given, "stream_id"),
+        stream_id=stream_parameter(given, "stream"),
         kind=choice_parameter(given, "kind", KINDS),
         from_ns=from_ns,
         to_ns=to_ns,

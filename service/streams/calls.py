@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from typing import Any
 
 from viflow_anomaly_service.detector_pool import DeadlinePassedError
@@ -102,6 +102,17 @@ async def _judged_and_kept(core: ServiceCore, stream: LiveStream, work: StreamWo
         raise
 
 
+def _show(core: ServiceCore, stream: LiveStream, judged: JudgedCall, ids: Sequence[str] | None) -> None:
+    """The pairs of a call to whoever looks on."""
+    if not core.live.enabled or not judged.pairs:
+        return
+    rig = judged.step.state.rig
+    report = None if rig is None else rig.report(judged.begun.stream.config.rig_estimate)
+    for place, pair in enumerate(judged.pairs):
+        stored = None if ids is None else ids[place]
+        core.live.remember(stream.stream_id, stream.session_id, pair, detection_id=stored, rig=report)
+
+
 async def _kept(core: ServiceCore, stream: LiveStream, judged: JudgedCall) -> bytes:
     """The stream advances once its detections are on the disk: a call that was refused can be sent again."""
     step, received = judged.step, judged.received
@@ -116,6 +127,7 @@ async def _kept(core: ServiceCore, stream: LiveStream, judged: JudgedCall) -> by
     begun = stream.begun is None
     core.streams.advance(stream, judged.begun, step)
     core.events.desk.took(noticed)
+    _show(core, stream, judged, ids)
     if received.frame is not None:
         stream.received_frames += 1
     if received.imu is not None:

@@ -76,6 +76,7 @@ def add_streams(app: FastAPI, core: ServiceCore) -> None:
         """Forget a stream: the next frame of this name begins another one."""
         require_one_process(core)
         core.streams.forget(core.streams.require(stream_id))
+        core.live.forget(stream_id)
         return Response(status_code=204)
 
     add_stream_sockets(app, core)

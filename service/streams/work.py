@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, cast
 
 from pydantic import ValidationError
@@ -13,11 +13,13 @@ from pydantic import ValidationError
 from viflow_anomaly.datasets.camera_json import camera_from_mapping
 from viflow_anomaly.detection import Detection, to_json
 from viflow_anomaly.errors import ViflowError
+from viflow_anomaly.inspection import PairSigns, pair_signs
 from viflow_anomaly.pair_detector import PairDetector
 from viflow_anomaly.prediction import PredictedFlow
 from viflow_anomaly.sensor_data import FramePair
-from viflow_anomaly.stream import DetectionStream, Judged, StreamConfig, StreamState, StreamStep
+from viflow_anomaly.stream import DetectionStream, Judged, PairJudge, StreamConfig, StreamState, StreamStep
 from viflow_anomaly_service.detector_pool import Job
+from viflow_anomaly_service.live.pair_memory import JudgedPair
 from viflow_anomaly_service.metrics import ServiceMetrics, Stage
 from viflow_anomaly_service.models.table import LoadedModel, ModelSet
 from viflow_anomaly_service.problems import Problem, problem_of_error, problem_of_validation
@@ -47,12 +49,14 @@ class JudgedCall:
         begun: the stream from now on.
         step: the state behind it, detections and faults.
         bodies: the detections' JSON.
+        pairs: what each of them was made from.
     """
 
     received: StreamInput
     begun: BegunStream
     step: StreamStep
     bodies: list[str]
+    pairs: list[JudgedPair]
 
 
 class _Analyzing(Protocol):
@@ -75,6 +79,23 @@ class StreamJudge:
         if hasattr(self.detector, "analyze"):
             return cast(_Analyzing, self.detector).analyze(pair, decode_ms=decode_ms)
         return _DetectionOnly(self.detector.detect(pair, decode_ms=decode_ms))
+
+
+class ObservedJudge:
+    """Notes which pairs a call judged, so that they can be looked at afterwards.
+
+    Attributes:
+        seen: pair and signs of each, in order.
+    """
+
+    def __init__(self, judge: PairJudge) -> None:
+        self._judge = judge
+        self.seen: list[tuple[FramePair, PairSigns]] = []
+
+    def analyze(self, pair: FramePair, *, decode_ms: float = 0.0) -> Judged:
+        judged = self._judge.analyze(pair, decode_ms=decode_ms)
+        self.seen.append((pair, pair_signs(pair, judged.predicted)))
+        return judged
 
 
 class StreamWork:
@@ -125,14 +146,20 @@ class StreamWork:
             begun = self._stream_of(received)
         job.require_wanted()
         with self._stage("detect"):
-            step = feed(begun.stream, self._state, received)
+            observed = ObservedJudge(begun.stream.detector)
+            step = feed(replace(begun.stream, detector=observed), self._state, received)
         job.require_wanted()
         with self._stage("encode"):
             bodies = [to_json(detection) for detection in step.detections]
         for detection in step.detections:
             self._metrics.observe_detection(detection, begun.model.name)
         self.log |= {"pairs": len(bodies), "faults": len(step.faults)}
-        return JudgedCall(received, begun, step, bodies)
+        detector = cast(StreamJudge, begun.stream.detector).detector  # as new_stream makes it
+        pairs = [
+            JudgedPair(pair, detector, detection, body, signs)
+            for (pair, signs), detection, body in zip(observed.seen, step.detections, bodies, strict=True)
+        ]
+        return JudgedCall(received, begun, step, bodies, pairs)
 
     def _stream_of(self, received: StreamInput) -> BegunStream:
         said = received.setup

@@ -104,7 +104,7 @@ def test_the_last_id_resumes_without_gap_or_repetition(telling: LiveServer) -> N
 
 
 def test_a_reader_of_one_stream_hears_of_no_other(telling: LiveServer) -> None:
-    with reading(url(telling), stream_id="door") as stream:
+    with reading(url(telling), stream="door") as stream:
         play(telling.client, "hall", ONE_EVENT)
         play(telling.client, "door", ONE_EVENT)
         wait_until(lambda: len(stream.messages) == 3)
@@ -235,7 +235,7 @@ def test_pages_filters_and_export_give_everything_once(storing: LiveServer, monk
         assert found == expected
         export = storing.client.get("/events.ndjson", params={"order": order})
         assert [json.loads(line) for line in export.text.splitlines()] == expected
-    assert listed(storing, stream_id="door", order="asc")["events"] == everything[3:]
+    assert listed(storing, stream="door", order="asc")["events"] == everything[3:]
     assert [one["kind"] for one in listed(storing, kind="end")["events"]] == ["end"] * 2
     middle = everything[1]["timestamp_ns"]
     later = [one for one in everything if one["timestamp_ns"] >= middle]
@@ -247,14 +247,14 @@ def test_pages_filters_and_export_give_everything_once(storing: LiveServer, monk
     ("path", "code", "field"),
     [
         ("/events?kind=stop", "parameter_invalid", "kind"),
-        ("/events?stream_id=a/b", "parameter_invalid", "stream_id"),
+        ("/events?stream=a/b", "parameter_invalid", "stream"),
         ("/events?stream=a", "parameter_unknown", "stream"),
         ("/events?order=up", "parameter_invalid", "order"),
         ("/events?limit=0", "parameter_invalid", "limit"),
         ("/events?from_ns=5&to_ns=5", "parameter_invalid", "to_ns"),
         ("/events?cursor=x", "cursor_invalid", "cursor"),
         ("/events.ndjson?limit=5", "parameter_unknown", "limit"),
-        ("/events/live?stream_id=", "parameter_invalid", "stream_id"),
+        ("/events/live?stream=", "parameter_invalid", "stream"),
         ("/events/live?kind=end", "parameter_unknown", "kind"),
         ("/events/deliveries?state=lost", "parameter_invalid", "state"),
         ("/events/deliveries?limit=1001", "parameter_invalid", "limit"),

@@ -62,7 +62,16 @@ def test_health_and_readiness_need_no_key(guarded: Guarded) -> None:
 
 
 def test_without_a_key_nothing_else_answers(guarded: Guarded) -> None:
-    for path in ("/version", "/openapi.json", "/docs", "/schemas/detection-1.0.json", "/nowhere", "/healthz/", "/"):
+    for path in (
+        "/version",
+        "/openapi.json",
+        "/docs",
+        "/schemas/detection-1.0.json",
+        "/nowhere",
+        "/healthz/",
+        "/dashboard",
+        "/live",
+    ):
         response = guarded.server.client.get(path)
         assert_problem(response, 401, "key_missing", None)
         assert response.headers["www-authenticate"].startswith("Bearer")

@@ -86,6 +86,14 @@ def test_operation_ids_are_stable(document: dict[str, Any]) -> None:
         ("/streams/{stream_id}", "get"): "getStream",
         ("/streams/{stream_id}", "delete"): "deleteStream",
         ("/streams/{stream_id}/frames", "post"): "addFrame",
+        ("/live", "get"): "listLive",
+        ("/live/events", "get"): "followAll",
+        ("/streams/{stream_id}/live", "get"): "followStream",
+        ("/streams/{stream_id}/pairs", "get"): "listPairs",
+        ("/streams/{stream_id}/pairs/{number}/{picture}", "get"): "getPairPicture",
+        ("/streams/{stream_id}/pairs/{number}/inspect", "post"): "inspectPair",
+        ("/inspect", "post"): "inspect",
+        ("/detector", "get"): "getDetector",
     }
 
 

@@ -45,7 +45,7 @@ def serve(
     config: ConfigFile = None,
     assignments: Assignments = None,
 ) -> None:
-    """Serve POST /detect, /healthz, /readyz, /version, /models and /metrics over HTTP until SIGINT or SIGTERM.
+    """Serve POST /detect, streams, a dashboard at /, /healthz, /readyz, /models and /metrics until SIGINT or SIGTERM.
 
     On loopback no key is needed; where other machines can reach the service it starts with a key file only.
 
