@@ -56,7 +56,7 @@ class EventStream:
 def reading(base_url: str, *, last_event_id: str | None = None, stream_id: str | None = None) -> Iterator[EventStream]:
     """Connected until the block ends."""
     stream = EventStream()
-    params = {} if stream_id is None else {"stream_id": stream_id}
+    params = {} if stream_id is None else {"stream": stream_id}
     headers = {} if last_event_id is None else {"Last-Event-ID": last_event_id}
     with httpx.Client(base_url=base_url, trust_env=False) as client:
         thread = threading.Thread(target=stream.read, args=(client, params, headers))

@@ -104,7 +104,7 @@ def test_the_last_id_resumes_without_gap_or_repetition(telling: LiveServer) -> N
 
 
 def test_a_reader_of_one_stream_hears_of_no_other(telling: LiveServer) -> None:
-    with reading(url(telling), stream="door") as stream:
+    with reading(url(telling), stream_id="door") as stream:
         play(telling.client, "hall", ONE_EVENT)
         play(telling.client, "door", ONE_EVENT)
         wait_until(lambda: len(stream.messages) == 3)
@@ -248,7 +248,7 @@ def test_pages_filters_and_export_give_everything_once(storing: LiveServer, monk
     [
         ("/events?kind=stop", "parameter_invalid", "kind"),
         ("/events?stream=a/b", "parameter_invalid", "stream"),
-        ("/events?stream=a", "parameter_unknown", "stream"),
+        ("/events?stream_id=a", "parameter_unknown", "stream_id"),
         ("/events?order=up", "parameter_invalid", "order"),
         ("/events?limit=0", "parameter_invalid", "limit"),
         ("/events?from_ns=5&to_ns=5", "parameter_invalid", "to_ns"),
