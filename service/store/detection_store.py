@@ -9,13 +9,14 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from pathlib import Path
 from typing import Any, Final
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from viflow_anomaly_service.store.engine import UNTIL, make_engine, migrate, store_url
-from viflow_anomaly_service.store.failures import store_failures
+from viflow_anomaly_service.store.failures import store_error, store_failures
 from viflow_anomaly_service.store.query import DetectionFilter, PageRequest
 from viflow_anomaly_service.store.record import Record, StoredDetection, first_id_at
 from viflow_anomaly_service.store.tables import DETECTIONS, LABELS, PROBE
@@ -62,6 +63,7 @@ class DetectionStore:
                 if self._file is not None:
                     logger.error("store_file_replaced", extra={"store": self.place})
                 self._file = None
+                self._require_writable_folder()
                 migrate(self._engine)
                 self._file = self._found_file()
             elif self._file is None:
@@ -167,6 +169,12 @@ class DetectionStore:
 
     def _writing(self) -> AbstractContextManager[Connection]:
         return self._engine.execution_options(writes=True).begin()
+
+    def _require_writable_folder(self) -> None:
+        """SQLite itself would say no more than that it cannot open its file."""
+        folder = Path(str(self._url.database)).absolute().parent
+        if folder.is_dir() and not os.access(folder, os.W_OK):
+            raise store_error("store_read_only")
 
     def _found_file(self) -> tuple[int, int] | None:
         """Which file there is under the name; None where there is none."""

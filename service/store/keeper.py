@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -15,6 +16,7 @@ from viflow_anomaly.detection import Detection
 from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.settings import ServiceSettings
+from viflow_anomaly_service.store.age_clock import AgeClock, seconds_since_boot
 from viflow_anomaly_service.store.detection_store import DetectionStore
 from viflow_anomaly_service.store.failures import StoreError, store_error
 from viflow_anomaly_service.store.query import DetectionFilter, PageRequest, cursor_of
@@ -66,6 +68,7 @@ class ResultKeeper:
         self._settings = settings
         self._metrics = StoreMetrics(metrics)
         self._new_id = IdMaker()
+        self._clock = AgeClock(time.time, seconds_since_boot)
         self._failure: StoreError | None = store_error("store_opening")
         self._waiting: list[tuple[list[Record], asyncio.Future[None]]] = []
         self._committing: asyncio.Task[None] | None = None
@@ -227,8 +230,9 @@ class ResultKeeper:
         age_s, size = self._settings.store_max_age_s, self._settings.store_max_bytes
         while True:
             if self._failure is None or self._failure.code == "store_full":
+                by_age_s = age_s if self._clock.is_believed() else None
                 try:
-                    deleted = await self._read(lambda: self._store.prune(max_age_s=age_s, max_bytes=size))
+                    deleted = await self._read(partial(self._store.prune, max_age_s=by_age_s, max_bytes=size))
                 except Problem as problem:
                     logger.warning("store_not_pruned", extra={"code": problem.code})
                 except Exception:  # as above

@@ -1,4 +1,4 @@
-"""The OpenAPI document and the service agree: what schemathesis makes of the one is answered as it says by the other."""
+"""The OpenAPI document and the service agree: what schemathesis makes of the one, the other answers as it says."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from viflow_anomaly_service.api_keys import new_key
 pytest.importorskip("schemathesis")
 pytestmark = pytest.mark.timeout(280)
 EXAMPLES = "4"
-"""Random ones for each operation, beside those that cover each rule of a schema; `benchmarks/fuzz_inputs.py` has more."""
+"""Random ones for each operation, beside those that cover each rule of a schema."""
 
 
 def check_contract(server: LiveServer, folder: Path, *options: str) -> None:
