@@ -149,6 +149,14 @@ def with_wrong_samples(rng: random.Random, request: dict[str, Any]) -> dict[str,
     return request | {"imu": imu}
 
 
+def image_bytes(text: Any) -> bytes:
+    """What base64 says; nothing where it is none."""
+    try:
+        return base64.b64decode(text)
+    except (TypeError, ValueError):
+        return b""
+
+
 def as_form(rng: random.Random, request: dict[str, Any]) -> bytes:
     """The multipart form that says the same; what has no place in one is left out."""
     imu = dict(request["imu"]) if isinstance(request.get("imu"), dict) else request.get("imu")
@@ -158,8 +166,7 @@ def as_form(rng: random.Random, request: dict[str, Any]) -> bytes:
         if isinstance(part, dict):
             if isinstance(imu, dict) and "timestamp_ns" in part:
                 imu[f"{name}_timestamp_ns"] = part["timestamp_ns"]
-            text = part.get("image_base64")
-            parts.append((name, base64.b64decode(text) if isinstance(text, str) and text.isascii() else b""))
+            parts.append((name, image_bytes(part.get("image_base64"))))
     parts.append(("imu", json.dumps(imu).encode()))
     parts.append(
         ("request", json.dumps({name: request[name] for name in ("camera", "options") if name in request}).encode())

@@ -6,6 +6,7 @@ import random
 import struct
 import zlib
 from collections.abc import Callable
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -26,8 +27,13 @@ OTHERS = (
 
 
 def texture(rng: random.Random) -> np.ndarray:
-    """[H, W] uint8."""
-    noise = np.random.default_rng(rng.randrange(64)).integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
+    """[H, W] uint8, one of a few."""
+    return _texture(rng.randrange(64))
+
+
+@lru_cache
+def _texture(seed: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
     return np.asarray(cv2.GaussianBlur(noise, (0, 0), 2.0))
 
 
