@@ -32,8 +32,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "service"
 
 import cv2
 from fastapi import FastAPI
-from fuzz_requests import bad_request
-from fuzz_wire import WireServer, ask_wire, damaged_wire
+from fuzzing.requests import bad_request
+from fuzzing.wire import WireServer, ask_wire, damaged_wire
 from rule_detector import RuleDetector
 
 from viflow_anomaly.allocator import keep_freed_memory

@@ -1,4 +1,4 @@
-"""Whole requests that are wrong: endpoint, head and body; see ``fuzz_bodies.py`` and ``fuzz_images.py``."""
+"""Whole requests that are wrong: endpoint, head and body; see ``bodies.py`` and ``images.py``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import random
 from typing import Any
 from urllib.parse import quote_from_bytes
 
-from fuzz_bodies import (
+from fuzzing.bodies import (
     FORM,
     INTEGERS,
     JSON_BODIES,
@@ -22,7 +22,7 @@ from fuzz_bodies import (
     with_wrong_places,
     with_wrong_samples,
 )
-from fuzz_images import IMAGES, mutated
+from fuzzing.images import IMAGES, mutated
 
 BODY_SHARE = 0.9
 TYPES = (

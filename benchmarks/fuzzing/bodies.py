@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from fuzz_images import good_image, mutated
+from fuzzing.images import good_image, mutated
 
 T0_NS = 1_700_000_000_000_000_000
 INTERVAL_NS = 50_000_000

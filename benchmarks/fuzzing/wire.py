@@ -12,8 +12,8 @@ from typing import Self
 
 import uvicorn
 from fastapi import FastAPI
-from fuzz_images import mutated
-from fuzz_requests import bad_request
+from fuzzing.images import mutated
+from fuzzing.requests import bad_request
 
 from viflow_anomaly_service.connection_guard import guarded_protocol
 from viflow_anomaly_service.settings import ServiceSettings
