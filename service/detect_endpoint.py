@@ -76,7 +76,7 @@ async def _judged_and_kept(core: ServiceCore, work: DetectionWork) -> tuple[byte
     if core.keeper is None or work.detection is None:
         return answer, {}
     started = time.perf_counter()
-    (kept_as,) = await core.keeper.keep([(work.detection, answer.decode())])
+    (kept_as,) = await core.keeper.keep([(work.detection, answer.decode())], thumbnails=[work.thumbnail])
     core.metrics.observe_stage("store", time.perf_counter() - started)
     return answer, {DETECTION_ID_HEADER: kept_as}
 

@@ -15,6 +15,7 @@ from viflow_anomaly_service.detector_pool import Job
 from viflow_anomaly_service.metrics import ServiceMetrics, Stage
 from viflow_anomaly_service.problems import problem_of_error
 from viflow_anomaly_service.settings import ServiceSettings
+from viflow_anomaly_service.thumbnails import wanted_thumbnail
 
 
 class DetectionWork:
@@ -30,6 +31,7 @@ class DetectionWork:
     Attributes:
         log: what the request's log line says of it: milliseconds by stage, status and number of regions.
         detection: what the answer says; None before there is one.
+        thumbnail: the picture that is kept beside it; None: there is none.
     """
 
     def __init__(
@@ -48,6 +50,7 @@ class DetectionWork:
         self._metrics = metrics
         self.log: dict[str, Any] = {}
         self.detection: Detection | None = None
+        self.thumbnail: bytes | None = None
 
     def __call__(self, job: Job[bytes]) -> bytes:
         """The detection as UTF-8 JSON.
@@ -71,6 +74,7 @@ class DetectionWork:
         self._describe(detection)
         job.require_wanted()
         with self._stage("encode"):
+            self.thumbnail = wanted_thumbnail(self._settings, pair.source.image, detection)
             return to_json(detection).encode("utf-8")
 
     @contextmanager

@@ -71,6 +71,7 @@ def _origins(value: Any) -> Any:
     return tuple(found)
 
 
+ThumbnailChoice = Literal["none", "motion", "all"]
 Origins = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_origins)]
 Cameras = Annotated[tuple[WarmUpCamera, ...], NoDecode, BeforeValidator(_cameras)]
 _EUROC: Final = (WarmUpCamera(752, 480, None), WarmUpCamera(752, 480, 458.0))
@@ -128,6 +129,10 @@ class ServiceSettings(BaseSettings):
     )
     store_max_age_s: PositiveFloat | None = Field(default=None, description="older detections are deleted")
     store_max_bytes: PositiveInt = Field(default=8 * 1024 * MEBIBYTE, description="of detections that stay")
+    thumbnails: ThumbnailChoice = Field(
+        default="motion", description="kept beside detections: none, motion (where something moves), all"
+    )
+    thumbnail_max_bytes: PositiveInt = Field(default=256 * MEBIBYTE, description="of all thumbnails that stay")
     max_streams: PositiveInt = Field(default=64, description="streams at once")
     max_stream_bytes: PositiveInt = Field(default=256 * MEBIBYTE, description="what all streams remember together")
     stream_idle_s: PositiveFloat = Field(default=60.0, description="after which a stream is forgotten")

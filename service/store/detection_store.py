@@ -19,7 +19,7 @@ from viflow_anomaly_service.store.engine import UNTIL, make_engine, migrate, sto
 from viflow_anomaly_service.store.failures import store_error, store_failures
 from viflow_anomaly_service.store.query import DetectionFilter, PageRequest
 from viflow_anomaly_service.store.record import Record, StoredDetection, first_id_at
-from viflow_anomaly_service.store.tables import DETECTIONS, LABELS, PROBE
+from viflow_anomaly_service.store.tables import DETECTIONS, LABELS, PROBE, THUMBNAILS
 
 logger = logging.getLogger(__name__)
 
@@ -92,11 +92,18 @@ class DetectionStore:
             for record in records
             for label, score in record.top_scores.items()
         ]
+        thumbnails = [
+            {"detection_id": record.id, "size_bytes": len(record.thumbnail), "image": record.thumbnail}
+            for record in records
+            if record.thumbnail is not None
+        ]
         self.open()
         with store_failures(), self._writing() as connection:
             connection.execute(sa.insert(DETECTIONS), rows)
             if labels:
                 connection.execute(sa.insert(LABELS), labels)
+            if thumbnails:
+                connection.execute(sa.insert(THUMBNAILS), thumbnails)
 
     def probe(self) -> None:
         """Write something, to see whether that works."""
@@ -111,6 +118,13 @@ class DetectionStore:
             row = connection.execute(sa.select(*_READ).where(DETECTIONS.c.id == detection_id)).one_or_none()
         return None if row is None else StoredDetection(*row)
 
+    def thumbnail(self, detection_id: str) -> bytes | None:
+        """The image file that is kept beside a detection."""
+        found = sa.select(THUMBNAILS.c.image).where(THUMBNAILS.c.detection_id == detection_id)
+        with store_failures(), self._engine.begin() as connection:
+            image: bytes | None = connection.execute(found).scalar_one_or_none()
+        return image
+
     def page(self, request: PageRequest) -> tuple[list[StoredDetection], bool]:
         """The detections of a page, and whether there are more; fewer than its limit where their JSON is large."""
         falling = request.filter.order == "desc"
@@ -124,28 +138,37 @@ class DetectionStore:
             rows = connection.execute(sa.select(*_READ).where(DETECTIONS.c.id.in_(ids)).order_by(by)).all()
         return [StoredDetection(*row) for row in rows], len(ids) < len(sized)
 
-    def prune(self, *, max_age_s: float | None, max_bytes: int | None) -> int:
+    def prune(self, *, max_age_s: float | None, max_bytes: int | None, thumbnail_max_bytes: int | None = None) -> int:
         """Delete what is too old, then the oldest of what is too much; the number of detections that are gone.
+
+        Thumbnails that are too much go alone: their detections stay.
 
         In many short transactions, so that nobody who stores waits for long.
         """
         self.open()
         deleted = 0
         if max_age_s is not None:
-            deleted += self._delete_before(first_id_at(time.time_ns() - round(max_age_s * 1e9)))
+            deleted += self._delete_before(DETECTIONS.c.id, first_id_at(time.time_ns() - round(max_age_s * 1e9)))
         if max_bytes is not None:
-            deleted += self._delete_before(self._first_kept(max_bytes))
-        if deleted and self._engine.dialect.name == "sqlite":
+            first_kept = self._first_kept(DETECTIONS.c.id, DETECTIONS.c.size_bytes, max_bytes)
+            deleted += self._delete_before(DETECTIONS.c.id, first_kept)
+        thumbnails = 0
+        if thumbnail_max_bytes is not None:
+            column = THUMBNAILS.c.detection_id
+            thumbnails = self._delete_before(
+                column, self._first_kept(column, THUMBNAILS.c.size_bytes, thumbnail_max_bytes)
+            )
+        if (deleted or thumbnails) and self._engine.dialect.name == "sqlite":
             with store_failures(), contextlib.closing(self._engine.raw_connection()) as connection:
                 connection.info.pop(UNTIL, None)
                 # executescript runs it to its end; execute would free one page
                 connection.cursor().executescript(f"PRAGMA incremental_vacuum({_VACUUMED_PAGES})")
         return deleted
 
-    def _first_kept(self, max_bytes: int) -> str | None:
+    def _first_kept(self, ids: sa.Column[Any], size: sa.Column[Any], max_bytes: int) -> str | None:
         """The id before which all is too much; None: nothing is."""
-        size, newest_first = DETECTIONS.c.size_bytes, DETECTIONS.c.id.desc()
-        running = sa.select(DETECTIONS.c.id, sa.func.sum(size).over(order_by=newest_first).label("total")).subquery()
+        total_so_far = sa.func.sum(size).over(order_by=ids.desc()).label("total")
+        running = sa.select(ids.label("id"), total_so_far).subquery()
         kept = sa.select(sa.func.min(running.c.id)).where(running.c.total <= max_bytes)
         with store_failures(), self._engine.begin() as connection:
             total = connection.execute(sa.select(sa.func.sum(size))).scalar_one() or 0
@@ -154,16 +177,16 @@ class DetectionStore:
             first: str | None = connection.execute(kept).scalar_one()
         return first_id_at(time.time_ns()) if first is None else first
 
-    def _delete_before(self, first_kept: str | None) -> int:
+    def _delete_before(self, ids: sa.Column[Any], first_kept: str | None) -> int:
         deleted = 0
         while first_kept is not None:
-            old = sa.select(DETECTIONS.c.id).where(DETECTIONS.c.id < first_kept).order_by(DETECTIONS.c.id)
+            old = sa.select(ids).where(ids < first_kept).order_by(ids)
             old = old.limit(DELETED_AT_ONCE).with_for_update(skip_locked=True)  # another replica deletes the rest
             with store_failures(), self._writing() as connection:
-                ids = list(connection.execute(old).scalars())
-                connection.execute(sa.delete(DETECTIONS).where(DETECTIONS.c.id.in_(ids)))
-            deleted += len(ids)
-            if len(ids) < DELETED_AT_ONCE:
+                found = list(connection.execute(old).scalars())
+                connection.execute(sa.delete(ids.table).where(ids.in_(found)))
+            deleted += len(found)
+            if len(found) < DELETED_AT_ONCE:
                 break
         return deleted
 

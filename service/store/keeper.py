@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from itertools import zip_longest
 from typing import Final, TypeVar
 
 from prometheus_client import Counter, Gauge
@@ -108,8 +109,12 @@ class ResultKeeper:
         *,
         stream_id: str | None = None,
         session_id: str | None = None,
+        thumbnails: Sequence[bytes | None] = (),
     ) -> list[str]:
         """The ids under which detections, each with its JSON, are kept; when this returns they are on the disk.
+
+        Args:
+            thumbnails: one for each detection, or none at all.
 
         Raises:
             Problem: 503 ``store_...``: they were not kept, or nobody knows.
@@ -118,8 +123,8 @@ class ResultKeeper:
             return []
         self.require_usable()
         records = [
-            record_of(detection, body, self._new_id(), stream_id=stream_id, session_id=session_id)
-            for detection, body in detections
+            record_of(detection, body, self._new_id(), stream_id=stream_id, session_id=session_id, thumbnail=thumbnail)
+            for (detection, body), thumbnail in zip_longest(detections, thumbnails)
         ]
         try:
             await self._committed(records)
@@ -134,6 +139,14 @@ class ResultKeeper:
             Problem: 503 ``store_...``.
         """
         return await self._read(lambda: self._store.get(detection_id))
+
+    async def thumbnail(self, detection_id: str) -> bytes | None:
+        """The image file beside a detection; None: there is none (any more).
+
+        Raises:
+            Problem: 503 ``store_...``.
+        """
+        return await self._read(lambda: self._store.thumbnail(detection_id))
 
     async def page(self, request: PageRequest) -> tuple[list[StoredDetection], str | None]:
         """Detections, and the cursor behind them where there are more.
@@ -232,7 +245,13 @@ class ResultKeeper:
             if self._failure is None or self._failure.code == "store_full":
                 by_age_s = age_s if self._clock.is_believed() else None
                 try:
-                    deleted = await self._read(partial(self._store.prune, max_age_s=by_age_s, max_bytes=size))
+                    prune = partial(
+                        self._store.prune,
+                        max_age_s=by_age_s,
+                        max_bytes=size,
+                        thumbnail_max_bytes=self._settings.thumbnail_max_bytes,
+                    )
+                    deleted = await self._read(prune)
                 except Problem as problem:
                     logger.warning("store_not_pruned", extra={"code": problem.code})
                 except Exception:  # as above

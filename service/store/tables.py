@@ -1,10 +1,10 @@
-"""The two tables, as the newest migration leaves them (a test compares the two)."""
+"""The tables, as the newest migration leaves them (a test compares the two)."""
 
 from __future__ import annotations
 
 from typing import Final
 
-from sqlalchemy import BigInteger, Column, Float, ForeignKey, Index, Integer, MetaData, String, Table, Text
+from sqlalchemy import BigInteger, Column, Float, ForeignKey, Index, Integer, LargeBinary, MetaData, String, Table, Text
 
 ID_CHARACTERS: Final = 32
 
@@ -34,6 +34,15 @@ LABELS: Final = Table(
     Column("label", String(64), primary_key=True),
     Column("top_score", Float, nullable=False),
 )
+
+THUMBNAILS: Final = Table(
+    "thumbnails",
+    METADATA,
+    Column("detection_id", ID_TYPE, ForeignKey("detections.id", ondelete="CASCADE"), primary_key=True),
+    Column("size_bytes", Integer, nullable=False),
+    Column("image", LargeBinary, nullable=False),
+)
+Index("thumbnails_by_size", THUMBNAILS.c.detection_id, THUMBNAILS.c.size_bytes)
 
 PROBE: Final = Table(
     "store_probe",

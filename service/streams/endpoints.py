@@ -144,7 +144,9 @@ async def _kept(core: ServiceCore, stream: LiveStream, judged: JudgedCall) -> by
     ids = None
     if core.keeper is not None:
         pairs = list(zip(step.detections, judged.bodies, strict=True))
-        ids = await core.keeper.keep(pairs, stream_id=stream.stream_id, session_id=stream.session_id)
+        ids = await core.keeper.keep(
+            pairs, stream_id=stream.stream_id, session_id=stream.session_id, thumbnails=judged.thumbnails
+        )
     begun = stream.setup is None
     core.streams.advance(stream, judged.setup, judged.stream, step)
     if received.frame is not None:

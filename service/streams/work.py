@@ -23,6 +23,7 @@ from viflow_anomaly_service.problems import Problem, problem_of_error, problem_o
 from viflow_anomaly_service.settings import ServiceSettings
 from viflow_anomaly_service.streams.request import StreamInput, read_input
 from viflow_anomaly_service.streams.schemas import StreamSetup
+from viflow_anomaly_service.thumbnails import wanted_thumbnail
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class JudgedCall:
         setup, stream: of the stream from now on.
         step: the state behind it, detections and faults.
         bodies: the detections' JSON.
+        thumbnails: the pictures that are kept beside them.
     """
 
     received: StreamInput
@@ -41,6 +43,7 @@ class JudgedCall:
     stream: DetectionStream
     step: StreamStep
     bodies: list[str]
+    thumbnails: list[bytes | None]
 
 
 class _Analyzing(Protocol):
@@ -119,10 +122,16 @@ class StreamWork:
         job.require_wanted()
         with self._stage("encode"):
             bodies = [to_json(detection) for detection in step.detections]
+            thumbnails = self._thumbnails(received, step)
         for detection in step.detections:
             self._metrics.observe_detection(detection)
         self.log |= {"pairs": len(bodies), "faults": len(step.faults)}
-        return JudgedCall(received, setup, stream, step, bodies)
+        return JudgedCall(received, setup, stream, step, bodies, thumbnails)
+
+    def _thumbnails(self, received: StreamInput, step: StreamStep) -> list[bytes | None]:
+        frames = (*self._state.frames, *(() if received.frame is None else (received.frame,)))
+        images = {frame.timestamp_ns: frame.image for frame in frames}
+        return [wanted_thumbnail(self._settings, images[one.source_timestamp_ns], one) for one in step.detections]
 
     def _stream_of(self, received: StreamInput) -> tuple[StreamSetup, DetectionStream]:
         said = received.setup

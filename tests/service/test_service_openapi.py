@@ -73,6 +73,7 @@ def test_operation_ids_are_stable(document: dict[str, Any]) -> None:
         ("/detections", "get"): "listDetections",
         ("/detections.ndjson", "get"): "exportDetections",
         ("/detections/{detection_id}", "get"): "getDetection",
+        ("/detections/{detection_id}/thumbnail", "get"): "getThumbnail",
         ("/streams", "get"): "listStreams",
         ("/streams/{stream_id}", "get"): "getStream",
         ("/streams/{stream_id}", "delete"): "deleteStream",
