@@ -15,6 +15,7 @@ from viflow_anomaly_service.detector_pool import Job
 from viflow_anomaly_service.metrics import ServiceMetrics, Stage
 from viflow_anomaly_service.problems import problem_of_error
 from viflow_anomaly_service.settings import ServiceSettings
+from viflow_anomaly_service.stage_times import StageTime
 from viflow_anomaly_service.thumbnails import wanted_thumbnail
 
 
@@ -30,6 +31,7 @@ class DetectionWork:
 
     Attributes:
         log: what the request's log line says of it: milliseconds by stage, status and number of regions.
+        stages: those that are over.
         detection: what the answer says; None before there is one.
         thumbnail: the picture that is kept beside it; None: there is none.
     """
@@ -49,6 +51,7 @@ class DetectionWork:
         self._settings = settings
         self._metrics = metrics
         self.log: dict[str, Any] = {}
+        self.stages: list[StageTime] = []
         self.detection: Detection | None = None
         self.thumbnail: bytes | None = None
 
@@ -88,6 +91,7 @@ class DetectionWork:
     def _note(self, stage: Stage, seconds: float) -> None:
         self._metrics.observe_stage(stage, seconds)
         self.log[f"{stage}_ms"] = round(seconds * 1e3, 3)
+        self.stages.append(StageTime.until_now(stage, seconds))
 
     def _describe(self, detection: Detection) -> None:
         self.log |= {"detection": detection.status, "regions": len(detection.rois)}

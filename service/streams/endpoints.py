@@ -17,6 +17,7 @@ from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.request_body import RequestBody
 from viflow_anomaly_service.request_log import log_fields
 from viflow_anomaly_service.service_core import ServiceCore
+from viflow_anomaly_service.stage_times import StageTime, stage_times
 from viflow_anomaly_service.store.query import STREAM_ID
 from viflow_anomaly_service.streams.openapi import (
     DELETE_OPERATION,
@@ -105,7 +106,10 @@ async def _answer(core: ServiceCore, request: Request, body: RequestBody, stream
     async with core.gate.admitted(), core.streams.turn(stream_id) as stream:
         started = time.perf_counter()
         data = await body.read(max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
-        core.metrics.observe_stage("upload", time.perf_counter() - started)
+        uploaded_s = time.perf_counter() - started
+        core.metrics.observe_stage("upload", uploaded_s)
+        stages = stage_times(request.scope)
+        stages.append(StageTime.until_now("upload", uploaded_s))
         known = None if stream.setup is None or stream.stream is None else (stream.setup, stream.stream)
         work = StreamWork(
             detector,
@@ -122,19 +126,26 @@ async def _answer(core: ServiceCore, request: Request, body: RequestBody, stream
         except DeadlinePassedError as err:
             raise core.gate.shed("deadline", f"no turn came within {settings.queue_timeout_s:g} s") from err
         finally:
+            stages.extend(work.stages)
             log_fields(request.scope).update(work.log)
 
 
 async def _judged_and_kept(core: ServiceCore, stream: LiveStream, work: StreamWork) -> bytes:
     """Cancelled before the call is judged, nothing has happened; after that it is finished, whoever has gone."""
     judged = await core.pool.run(work, within_s=core.settings.queue_timeout_s)
+    started = time.perf_counter()
     finishing = asyncio.ensure_future(_kept(core, stream, judged))
     try:
-        return await asyncio.shield(finishing)
+        answer = await asyncio.shield(finishing)
     except asyncio.CancelledError:
         with contextlib.suppress(Problem):
             await finishing
         raise
+    if core.keeper is not None:
+        stored_s = time.perf_counter() - started
+        core.metrics.observe_stage("store", stored_s)
+        work.stages.append(StageTime.until_now("store", stored_s))
+    return answer
 
 
 async def _kept(core: ServiceCore, stream: LiveStream, judged: JudgedCall) -> bytes:

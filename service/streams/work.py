@@ -21,6 +21,7 @@ from viflow_anomaly_service.detector_pool import Job
 from viflow_anomaly_service.metrics import ServiceMetrics, Stage
 from viflow_anomaly_service.problems import Problem, problem_of_error, problem_of_validation
 from viflow_anomaly_service.settings import ServiceSettings
+from viflow_anomaly_service.stage_times import StageTime
 from viflow_anomaly_service.streams.request import StreamInput, read_input
 from viflow_anomaly_service.streams.schemas import StreamSetup
 from viflow_anomaly_service.thumbnails import wanted_thumbnail
@@ -82,6 +83,7 @@ class StreamWork:
 
     Attributes:
         log: what the request's log line says of it.
+        stages: those that are over.
     """
 
     def __init__(
@@ -103,6 +105,7 @@ class StreamWork:
         self._settings = settings
         self._metrics = metrics
         self.log: dict[str, Any] = {}
+        self.stages: list[StageTime] = []
 
     def __call__(self, job: Job[JudgedCall]) -> JudgedCall:
         """The call judged.
@@ -157,6 +160,7 @@ class StreamWork:
     def _note(self, stage: Stage, seconds: float) -> None:
         self._metrics.observe_stage(stage, seconds)
         self.log[f"{stage}_ms"] = round(seconds * 1e3, 3)
+        self.stages.append(StageTime.until_now(stage, seconds))
 
 
 def new_stream(detector: PairDetector, received: StreamInput, settings: ServiceSettings) -> DetectionStream:
