@@ -9,12 +9,17 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import sqlalchemy as sa
+from alembic import command
+from alembic.config import Config
 from rule_detector import RuleDetector
 from service_world import INTERVAL_NS, T0, assert_problem, base64_text, imu_part, json_request, live_server, png
 
 from viflow_anomaly.drawing import VERMILLION
 from viflow_anomaly_service.store.detection_store import DetectionStore
+from viflow_anomaly_service.store.engine import MIGRATIONS, make_engine, store_url
 from viflow_anomaly_service.store.record import IdMaker, Record
+from viflow_anomaly_service.store.tables import DETECTIONS
 
 
 def moving_square(*, width: int = 800, height: int = 500, moves: bool = True) -> dict[str, Any]:
@@ -84,4 +89,22 @@ def test_the_oldest_pictures_go_first_and_their_detections_stay(empty_store_url:
     time.sleep(0.01)
     assert store.prune(max_age_s=0.0, max_bytes=None, thumbnail_max_bytes=3500) == len(records)
     assert all(store.thumbnail(one.id) is None for one in records)
+    store.close()
+
+
+def test_a_store_of_the_first_version_is_brought_up_to_date(empty_store_url: str) -> None:
+    engine = make_engine(store_url(empty_store_url))
+    config = Config()
+    config.set_main_option("script_location", str(MIGRATIONS))
+    config.set_main_option("path_separator", "os")
+    old = {"id": "0" * 32, "source_timestamp_ns": 0, "target_timestamp_ns": 1, "size_bytes": 2, "body": "{}"}
+    with engine.connect().execution_options(writes=True) as connection, connection.begin():
+        config.attributes["connection"] = connection
+        command.upgrade(config, "0001")
+        connection.execute(sa.insert(DETECTIONS), [old])
+    engine.dispose()
+    store = DetectionStore(empty_store_url)
+    store.add([Record(IdMaker()(), 0, 1, "{}", thumbnail=b"x")])
+    assert store.get("0" * 32) is not None
+    assert store.thumbnail("0" * 32) is None
     store.close()
