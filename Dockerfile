@@ -13,7 +13,7 @@ RUN pip install --no-deps --constraint constraints.txt --index-url https://downl
 COPY pyproject.toml README.md LICENSE ./
 COPY viflow_anomaly ./viflow_anomaly
 COPY service ./service
-RUN pip install --constraint constraints.txt '.[openvino,store,webhook,mqtt]' && pip check && pip uninstall --yes pip
+RUN pip install --constraint constraints.txt '.[openvino,store,webhook,mqtt,otel]' && pip check && pip uninstall --yes pip
 
 
 FROM python:3.11-slim-bookworm

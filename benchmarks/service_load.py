@@ -80,23 +80,26 @@ class Service:
         command = [sys.executable, str(CLIENT), str(self.port), str(self.folder / name), *flags]
         return subprocess.Popen(command, stdout=subprocess.PIPE)
 
-    def resident_mib(self) -> float:
-        """Memory of the service's processes together; pages that they share count in each."""
+    def pids(self) -> list[int]:
+        """Of the processes that serve."""
         children = (
             Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text(encoding="ascii").split()
         )
-        pids = [int(pid) for pid in children] or [self.process.pid]
-        return sum(resident_bytes(pid) or 0 for pid in pids) / 2**20
+        return [int(pid) for pid in children] or [self.process.pid]
+
+    def resident_mib(self) -> float:
+        """Memory of the service's processes together; pages that they share count in each."""
+        return sum(resident_bytes(pid) or 0 for pid in self.pids()) / 2**20
 
 
 @contextlib.contextmanager
-def running_service(workers: int) -> Iterator[Service]:
-    """The service as a user starts it, on a free port; its log goes to a file."""
+def running_service(workers: int, **variables: str) -> Iterator[Service]:
+    """The service as a user starts it, on a free port, with more ``variables``; its log goes to a file."""
     with tempfile.TemporaryDirectory() as folder, (Path(folder) / "log").open("wb") as log:
         environment = {name: value for name, value in os.environ.items() if not name.startswith("VIFLOW_")}
         process = subprocess.Popen(
             [sys.executable, "-m", "viflow_anomaly_service"],
-            env=environment | {"VIFLOW_PORT": "0", "VIFLOW_WORKERS": str(workers)},
+            env=environment | {"VIFLOW_PORT": "0", "VIFLOW_WORKERS": str(workers)} | variables,
             stderr=log,
         )
         try:

@@ -35,6 +35,7 @@ from viflow_anomaly_service.store.attach import configured_keeper
 from viflow_anomaly_service.store.endpoints import add_detections
 from viflow_anomaly_service.streams.endpoints import add_streams
 from viflow_anomaly_service.streams.table import StreamTable
+from viflow_anomaly_service.tracing import TracingMiddleware, configured_tracing, end_tracing
 
 MEMORY_SECONDS: Final = 5.0
 
@@ -58,6 +59,7 @@ def create_app(
         MissingDependencyError: ``store_missing``, ``webhook_missing``, ``mqtt_missing``.
     """
     core = _build(settings or load_settings(), load_detector, on_load_failure)
+    tracing = configured_tracing()
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -76,6 +78,8 @@ def create_app(
         await core.events.close(core.streams.begun())
         if core.keeper is not None:
             await core.keeper.close()
+        if tracing is not None:
+            await end_tracing(tracing)
 
     app = FastAPI(
         title="viflow-anomaly",
@@ -87,6 +91,8 @@ def create_app(
     )
     app.state.core = core
     add_access_control(app, core.settings)
+    if tracing is not None:
+        app.add_middleware(TracingMiddleware, provider=tracing)
     app.add_middleware(RequestLogMiddleware, metrics=core.metrics)
     app.add_middleware(SecurityHeadersMiddleware)
     install_problem_handlers(app)

@@ -14,6 +14,7 @@ from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.request_body import RequestBody, answered
 from viflow_anomaly_service.request_log import log_fields
 from viflow_anomaly_service.service_core import ServiceCore
+from viflow_anomaly_service.stage_times import StageTime, stage_times
 from viflow_anomaly_service.store.openapi import DETECTION_ID_HEADER
 
 JSON_MEDIA_TYPE: Final = "application/json"
@@ -54,6 +55,8 @@ async def _answer(core: ServiceCore, request: Request, body: RequestBody) -> tup
         data = await body.read(max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
         uploaded_s = time.perf_counter() - started
         core.metrics.observe_stage("upload", uploaded_s)
+        stages = stage_times(request.scope)
+        stages.append(StageTime.until_now("upload", uploaded_s))
         work = DetectionWork(models, data, content_type, settings=settings, metrics=core.metrics)
         del data  # the work alone holds it, and lets go of it once it is decoded
         try:
@@ -61,6 +64,7 @@ async def _answer(core: ServiceCore, request: Request, body: RequestBody) -> tup
         except DeadlinePassedError as err:
             raise core.gate.shed("deadline", f"no turn came within {settings.queue_timeout_s:g} s") from err
         finally:
+            stages.extend(work.stages)
             log_fields(request.scope).update(work.log, upload_ms=round(uploaded_s * 1e3, 3))
 
 
@@ -70,8 +74,10 @@ async def _judged_and_kept(core: ServiceCore, work: DetectionWork) -> tuple[byte
     if core.keeper is None or work.detection is None:
         return answer, {}
     started = time.perf_counter()
-    (kept_as,) = await core.keeper.keep([(work.detection, answer.decode())])
-    core.metrics.observe_stage("store", time.perf_counter() - started)
+    (kept_as,) = await core.keeper.keep([(work.detection, answer.decode())], thumbnails=[work.thumbnail])
+    stored_s = time.perf_counter() - started
+    core.metrics.observe_stage("store", stored_s)
+    work.stages.append(StageTime.until_now("store", stored_s))
     return answer, {DETECTION_ID_HEADER: kept_as}
 
 

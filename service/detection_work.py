@@ -15,6 +15,8 @@ from viflow_anomaly_service.metrics import ServiceMetrics, Stage
 from viflow_anomaly_service.models.table import ModelSet
 from viflow_anomaly_service.problems import problem_of_error
 from viflow_anomaly_service.settings import ServiceSettings
+from viflow_anomaly_service.stage_times import StageTime
+from viflow_anomaly_service.thumbnails import wanted_thumbnail
 
 
 class DetectionWork:
@@ -29,7 +31,9 @@ class DetectionWork:
 
     Attributes:
         log: what the request's log line says of it: milliseconds by stage, status and number of regions.
+        stages: those that are over.
         detection: what the answer says; None before there is one.
+        thumbnail: the picture that is kept beside it; None: there is none.
     """
 
     def __init__(
@@ -47,7 +51,9 @@ class DetectionWork:
         self._settings = settings
         self._metrics = metrics
         self.log: dict[str, Any] = {}
+        self.stages: list[StageTime] = []
         self.detection: Detection | None = None
+        self.thumbnail: bytes | None = None
 
     def __call__(self, job: Job[bytes]) -> bytes:
         """The detection as UTF-8 JSON.
@@ -71,6 +77,7 @@ class DetectionWork:
         self._describe(detection)
         job.require_wanted()
         with self._stage("encode"):
+            self.thumbnail = wanted_thumbnail(self._settings, pair.source.image, detection)
             return to_json(detection).encode("utf-8")
 
     @contextmanager
@@ -84,6 +91,7 @@ class DetectionWork:
     def _note(self, stage: Stage, seconds: float) -> None:
         self._metrics.observe_stage(stage, seconds)
         self.log[f"{stage}_ms"] = round(seconds * 1e3, 3)
+        self.stages.append(StageTime.until_now(stage, seconds))
 
     def _describe(self, detection: Detection) -> None:
         self.log |= {"detection": detection.status, "regions": len(detection.rois)}

@@ -10,6 +10,7 @@ from typing import Any, Final
 from fastapi import FastAPI, Request, Response
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
+from starlette.routing import Match
 
 from viflow_anomaly.errors import (
     ConfigError,
@@ -159,7 +160,14 @@ def install_problem_handlers(app: FastAPI) -> None:
         phrase = HTTPStatus(err.status_code).phrase
         code = phrase.lower().replace(" ", "_")
         problem = Problem(err.status_code, code=code, detail=f"{request.method} {request.url.path}: {phrase}")
-        return _answer(request, problem, err.headers)
+        is_method = err.status_code == HTTPStatus.METHOD_NOT_ALLOWED
+        return _answer(request, problem, {"Allow": _allowed_methods(request)} if is_method else err.headers)
+
+
+def _allowed_methods(request: Request) -> str:
+    """Of all routes of this path: each route for itself knows its own only."""
+    found = [route for route in request.app.router.routes if route.matches(request.scope)[0] is not Match.NONE]
+    return ", ".join(sorted({method for route in found for method in getattr(route, "methods", None) or ()}))
 
 
 def _answer(request: Request, problem: Problem, headers: Mapping[str, str] | None = None) -> Response:

@@ -42,7 +42,7 @@ class RateLimiter:
     """Counts in the memory of this process, for at most ``max_clients`` clients.
 
     Args:
-        clock: seconds since 1970, which say the day; a step back of it gives and takes nothing.
+        clock: seconds since 1970, which say the day; a step back of less than a week gives and takes nothing.
         max_clients: see ``MAX_CLIENTS``.
     """
 
@@ -93,7 +93,7 @@ class RateLimiter:
     @staticmethod
     def _require_quota(account: _Account, daily: int, now: float) -> None:
         day = int(now // DAY_SECONDS)
-        if day > account.day:
+        if day > account.day or day < account.day - 7:  # a clock that was far ahead, and was set right
             account.day, account.detections = day, 0
         if account.detections >= daily:
             wait_s = max(1, math.ceil((day + 1) * DAY_SECONDS - now))

@@ -21,6 +21,8 @@ logger = logging.getLogger(__name__)
 REQUEST_ID_HEADER: Final = "X-Request-ID"
 CLIENT_CLOSED_REQUEST: Final = 499  # nginx's number for a client that left before its answer
 _ACCEPTED_ID: Final = re.compile(r"[A-Za-z0-9._-]{1,64}", re.ASCII)
+_TRACE_PARENT: Final = re.compile(r"[0-9a-f]{2}-(?!0{32})(?P<trace>[0-9a-f]{32})-(?!0{16})[0-9a-f]{16}-[0-9a-f]{2}")
+"""W3C Trace Context: what a caller with traces of its own sends along."""
 _MAX_LOGGED_PATH: Final = 200
 
 
@@ -48,6 +50,8 @@ class RequestLogMiddleware:
             await self.app(scope, receive, send)
             return
         request_id = _request_id(scope)
+        if (traced := _TRACE_PARENT.fullmatch(Headers(scope=scope).get("traceparent", ""))) is not None:
+            log_fields(scope)["trace_id"] = traced["trace"]
         started = time.perf_counter()
         status = 0
 

@@ -27,7 +27,8 @@ CAMERA_SCHEMA = {
         "distortion_model": {"type": "string", "enum": list(DISTORTION_COEFF_COUNTS)},
         "distortion_coeffs": {"type": "array", "items": _NUMBER},
         "T_cam_imu": {
-            "type": "array",
+            "description": "null, as when it is absent: unknown",
+            "type": ["array", "null"],
             "items": {"type": "array", "items": _NUMBER, "minItems": 4, "maxItems": 4},
             "minItems": 4,
             "maxItems": 4,

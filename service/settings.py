@@ -87,6 +87,7 @@ def _texts(value: Any) -> Any:
     return tuple(text.strip() for text in value.split(",") if text.strip()) if isinstance(value, str) else value
 
 
+ThumbnailChoice = Literal["none", "motion", "all"]
 Origins = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_origins)]
 Score = Annotated[float, Field(ge=0, le=1)]
 Topic = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*$", max_length=100)]
@@ -147,6 +148,10 @@ class ServiceSettings(BaseSettings):
     )
     store_max_age_s: PositiveFloat | None = Field(default=None, description="older detections are deleted")
     store_max_bytes: PositiveInt = Field(default=8 * 1024 * MEBIBYTE, description="of detections that stay")
+    thumbnails: ThumbnailChoice = Field(
+        default="motion", description="kept beside detections: none, motion (where something moves), all"
+    )
+    thumbnail_max_bytes: PositiveInt = Field(default=256 * MEBIBYTE, description="of all thumbnails that stay")
     max_streams: PositiveInt = Field(default=64, description="streams at once")
     max_stream_bytes: PositiveInt = Field(default=256 * MEBIBYTE, description="what all streams remember together")
     stream_idle_s: PositiveFloat = Field(default=60.0, description="after which a stream is forgotten")

@@ -20,7 +20,7 @@ from viflow_anomaly.detection import (
     ResidualSummary,
     Roi,
 )
-from viflow_anomaly.drawing import OverlayVideo, draw_overlay
+from viflow_anomaly.drawing import OverlayVideo, draw_overlay, draw_thumbnail
 from viflow_anomaly.errors import InvalidInputError, MissingDependencyError
 from viflow_anomaly.regions import BoundingBox, RegionLabel
 
@@ -240,3 +240,14 @@ class TestOverlayVideo:
             video.write(self.picture(20))
         assert caught.value.code == "video_codec_missing"
         assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"), [((800, 400), (320, 160)), ((100, 500), (64, 320)), ((96, 64), (96, 64))]
+)
+def test_a_thumbnail_is_small_and_has_the_boxes_alone(size: tuple[int, int], expected: tuple[int, int]) -> None:
+    width, height = size
+    detection = make_detection(width, height, make_roi(width // 4, height // 4, width // 2, height // 2))
+    picture = draw_thumbnail(np.full((height, width), 128, dtype=np.uint8), detection, longest_side_px=320)
+    assert picture.shape == (expected[1], expected[0], 3)
+    assert has_color(picture, drawing.VERMILLION)

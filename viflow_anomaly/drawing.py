@@ -85,6 +85,23 @@ def draw_overlay(source: Uint8Array, detection: Detection, *, residual: Float32A
     return _with_even_sides(picture)
 
 
+def draw_thumbnail(source: Uint8Array, detection: Detection, *, longest_side_px: int) -> Picture:
+    """The source with its boxes alone, for lists; never larger than the source.
+
+    Args:
+        source: [H, W] uint8 gray image I_i.
+        detection: made from it.
+    """
+    height, width = source.shape
+    factor = min(1.0, longest_side_px / max(width, height))
+    size = max(1, round(width * factor)), max(1, round(height * factor))
+    scale = _Scale(size[0] / width, size[1] / height)
+    picture = np.repeat(_resized(source, size)[:, :, None], 3, axis=2)
+    for roi in sorted(detection.rois, key=lambda roi: (roi.label == "independent_motion", roi.score)):
+        _draw_box(picture, roi, scale)
+    return picture
+
+
 def _panel_size(width: int, height: int, min_width: int) -> tuple[int, int]:
     """Small images grow by a whole factor (every pixel stays a square), huge ones shrink to the maximum."""
     if width > MAX_PANEL_WIDTH_PX:

@@ -63,6 +63,8 @@ SERVICE_SETTINGS = (
     "store_url",
     "store_max_age_s",
     "store_max_bytes",
+    "thumbnails",
+    "thumbnail_max_bytes",
     "max_streams",
     "max_stream_bytes",
     "stream_idle_s",

@@ -8,16 +8,17 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from viflow_anomaly_service.store.engine import UNTIL, make_engine, migrate, store_url
-from viflow_anomaly_service.store.failures import store_failures
+from viflow_anomaly_service.store.failures import store_error, store_failures
 from viflow_anomaly_service.store.query import DetectionFilter, PageRequest
 from viflow_anomaly_service.store.record import Record, StoredDetection, first_id_at
-from viflow_anomaly_service.store.tables import DETECTIONS, EVENTS, LABELS, PROBE
+from viflow_anomaly_service.store.tables import DETECTIONS, EVENTS, LABELS, PROBE, THUMBNAILS
 
 logger = logging.getLogger(__name__)
 
@@ -61,6 +62,7 @@ class DetectionStore:
                 if self._file is not None:
                     logger.error("store_file_replaced", extra={"store": self.place})
                 self._file = None
+                self._require_writable_folder()
                 migrate(self._engine)
                 self._file = self._found_file()
             elif self._file is None:
@@ -93,12 +95,19 @@ class DetectionStore:
             for record in records
             for label, score in record.top_scores.items()
         ]
+        thumbnails = [
+            {"detection_id": record.id, "size_bytes": len(record.thumbnail), "image": record.thumbnail}
+            for record in records
+            if record.thumbnail is not None
+        ]
         self.open()
         with self.transaction(writes=True) as connection:
             if rows:
                 connection.execute(sa.insert(DETECTIONS), rows)
             if labels:
                 connection.execute(sa.insert(LABELS), labels)
+            if thumbnails:
+                connection.execute(sa.insert(THUMBNAILS), thumbnails)
             for action in along:
                 action(connection)
 
@@ -125,6 +134,13 @@ class DetectionStore:
             row = connection.execute(sa.select(*_READ).where(DETECTIONS.c.id == detection_id)).one_or_none()
         return None if row is None else StoredDetection(*row)
 
+    def thumbnail(self, detection_id: str) -> bytes | None:
+        """The image file that is kept beside a detection."""
+        found = sa.select(THUMBNAILS.c.image).where(THUMBNAILS.c.detection_id == detection_id)
+        with store_failures(), self._engine.begin() as connection:
+            image: bytes | None = connection.execute(found).scalar_one_or_none()
+        return image
+
     def page(self, request: PageRequest) -> tuple[list[StoredDetection], bool]:
         """The detections of a page, and whether there are more; fewer than its limit where their JSON is large."""
         falling = request.filter.order == "desc"
@@ -138,28 +154,37 @@ class DetectionStore:
             rows = connection.execute(sa.select(*_READ).where(DETECTIONS.c.id.in_(ids)).order_by(by)).all()
         return [StoredDetection(*row) for row in rows], len(ids) < len(sized)
 
-    def prune(self, *, max_age_s: float | None, max_bytes: int | None) -> int:
+    def prune(self, *, max_age_s: float | None, max_bytes: int | None, thumbnail_max_bytes: int | None = None) -> int:
         """Delete what is too old, then the oldest of what is too much; the number of detections that are gone.
+
+        Thumbnails that are too much go alone: their detections stay.
 
         In many short transactions, so that nobody who stores waits for long.
         """
         self.open()
         deleted = 0
-        if max_age_s is not None:
-            deleted += self._delete_before(first_id_at(time.time_ns() - round(max_age_s * 1e9)))
-        if max_bytes is not None:
-            deleted += self._delete_before(self._first_kept(max_bytes))
-        if deleted and self._engine.dialect.name == "sqlite":
+        too_old = None if max_age_s is None else first_id_at(time.time_ns() - round(max_age_s * 1e9))
+        too_much = None if max_bytes is None else self._first_kept(DETECTIONS.c.id, DETECTIONS.c.size_bytes, max_bytes)
+        for first_kept in (too_old, too_much):
+            deleted += self._delete_before(DETECTIONS.c.id, first_kept)
+            self._delete_before(EVENTS.c.event_id, first_kept)  # of their time; deliveries go with their events
+        thumbnails = 0
+        if thumbnail_max_bytes is not None:
+            column = THUMBNAILS.c.detection_id
+            thumbnails = self._delete_before(
+                column, self._first_kept(column, THUMBNAILS.c.size_bytes, thumbnail_max_bytes)
+            )
+        if (deleted or thumbnails) and self._engine.dialect.name == "sqlite":
             with store_failures(), contextlib.closing(self._engine.raw_connection()) as connection:
                 connection.info.pop(UNTIL, None)
                 # executescript runs it to its end; execute would free one page
                 connection.cursor().executescript(f"PRAGMA incremental_vacuum({_VACUUMED_PAGES})")
         return deleted
 
-    def _first_kept(self, max_bytes: int) -> str | None:
+    def _first_kept(self, ids: sa.Column[Any], size: sa.Column[Any], max_bytes: int) -> str | None:
         """The id before which all is too much; None: nothing is."""
-        size, newest_first = DETECTIONS.c.size_bytes, DETECTIONS.c.id.desc()
-        running = sa.select(DETECTIONS.c.id, sa.func.sum(size).over(order_by=newest_first).label("total")).subquery()
+        total_so_far = sa.func.sum(size).over(order_by=ids.desc()).label("total")
+        running = sa.select(ids.label("id"), total_so_far).subquery()
         kept = sa.select(sa.func.min(running.c.id)).where(running.c.total <= max_bytes)
         with self.transaction() as connection:
             total = connection.execute(sa.select(sa.func.sum(size))).scalar_one() or 0
@@ -168,26 +193,24 @@ class DetectionStore:
             first: str | None = connection.execute(kept).scalar_one()
         return first_id_at(time.time_ns()) if first is None else first
 
-    def _delete_before(self, first_kept: str | None) -> int:
+    def _delete_before(self, ids: sa.Column[Any], first_kept: str | None) -> int:
         deleted = 0
         while first_kept is not None:
-            old = sa.select(DETECTIONS.c.id).where(DETECTIONS.c.id < first_kept).order_by(DETECTIONS.c.id)
+            old = sa.select(ids).where(ids < first_kept).order_by(ids)
             old = old.limit(DELETED_AT_ONCE).with_for_update(skip_locked=True)  # another replica deletes the rest
             with self.transaction(writes=True) as connection:
-                ids = list(connection.execute(old).scalars())
-                connection.execute(sa.delete(DETECTIONS).where(DETECTIONS.c.id.in_(ids)))
-            deleted += len(ids)
-            if len(ids) < DELETED_AT_ONCE:
-                break
-        while first_kept is not None:  # events go with the detections of their time, and deliveries with their events
-            told = sa.select(EVENTS.c.seq).where(EVENTS.c.event_id < first_kept).order_by(EVENTS.c.seq)
-            told = told.limit(DELETED_AT_ONCE).with_for_update(skip_locked=True)
-            with self.transaction(writes=True) as connection:
-                seqs = list(connection.execute(told).scalars())
-                connection.execute(sa.delete(EVENTS).where(EVENTS.c.seq.in_(seqs)))
-            if len(seqs) < DELETED_AT_ONCE:
+                found = list(connection.execute(old).scalars())
+                connection.execute(sa.delete(ids.table).where(ids.in_(found)))
+            deleted += len(found)
+            if len(found) < DELETED_AT_ONCE:
                 break
         return deleted
+
+    def _require_writable_folder(self) -> None:
+        """SQLite itself would say no more than that it cannot open its file."""
+        folder = Path(str(self._url.database)).absolute().parent
+        if folder.is_dir() and not os.access(folder, os.W_OK):
+            raise store_error("store_read_only")
 
     def _found_file(self) -> tuple[int, int] | None:
         """Which file there is under the name; None where there is none."""

@@ -1,4 +1,4 @@
-"""``GET /detections``, ``GET /detections.ndjson`` and ``GET /detections/{id}``."""
+"""``GET /detections``, ``GET /detections.ndjson``, ``GET /detections/{id}`` and its thumbnail."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from viflow_anomaly_service.store.openapi import (
     GET_OPERATION,
     NDJSON_MEDIA_TYPE,
     PAGE_OPERATION,
+    THUMBNAIL_OPERATION,
     add_store_openapi,
 )
 from viflow_anomaly_service.store.query import (
@@ -22,12 +23,16 @@ from viflow_anomaly_service.store.query import (
     read_filter,
     read_page,
     require_detection_id,
+    thumbnail_not_found,
 )
+from viflow_anomaly_service.thumbnails import THUMBNAIL_MEDIA_TYPE
 
 if TYPE_CHECKING:
     from viflow_anomaly_service.store.keeper import ResultKeeper
 
 EXPORT_ROWS: Final = 200
+KEPT_BY_BROWSERS: Final = "private, max-age=31536000, immutable"
+"""A thumbnail never changes, and belongs to whoever had a key for it."""
 
 
 def add_detections(app: FastAPI, core: ServiceCore) -> None:
@@ -62,5 +67,23 @@ def add_detections(app: FastAPI, core: ServiceCore) -> None:
         if found is None:
             raise detection_not_found(detection_id)
         return Response(found.to_json(), media_type="application/json")
+
+    @app.get(
+        "/detections/{detection_id}/thumbnail",
+        operation_id="getThumbnail",
+        tags=["detections"],
+        response_class=Response,
+        **THUMBNAIL_OPERATION,
+    )
+    async def get_thumbnail(request: Request, detection_id: str) -> Response:
+        """A small picture of one stored detection: the source image with its regions."""
+        keeper = require_keeper()
+        image = await keeper.thumbnail(require_detection_id(detection_id))
+        if image is None:
+            raise thumbnail_not_found(detection_id)
+        headers = {"ETag": f'"{detection_id}"', "Cache-Control": KEPT_BY_BROWSERS}
+        if request.headers.get("if-none-match") == headers["ETag"]:
+            return Response(status_code=304, headers=headers)
+        return Response(image, media_type=THUMBNAIL_MEDIA_TYPE, headers=headers)
 
     add_store_openapi(app)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Callable
+import time
+from collections.abc import AsyncIterator, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from itertools import zip_longest
 from typing import Final, TypeVar
 
 from prometheus_client import Counter, Gauge
@@ -16,6 +18,7 @@ from viflow_anomaly.detection import Detection
 from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.settings import ServiceSettings
+from viflow_anomaly_service.store.age_clock import AgeClock, seconds_since_boot
 from viflow_anomaly_service.store.detection_store import DetectionStore
 from viflow_anomaly_service.store.failures import StoreError, store_error
 from viflow_anomaly_service.store.query import DetectionFilter, PageRequest, cursor_of
@@ -69,6 +72,7 @@ class ResultKeeper:
         self._settings = settings
         self._metrics = StoreMetrics(metrics)
         self._new_id = IdMaker()
+        self._clock = AgeClock(time.time, seconds_since_boot)
         self._failure: StoreError | None = store_error("store_opening")
         self._waiting: list[tuple[list[Record], Along | None, asyncio.Future[None]]] = []
         self._committing: asyncio.Task[None] | None = None
@@ -114,11 +118,13 @@ class ResultKeeper:
         stream_id: str | None = None,
         session_id: str | None = None,
         along: Callable[[list[str]], Along | None] = lambda ids: None,
+        thumbnails: Sequence[bytes | None] = (),
     ) -> list[str]:
         """The ids under which detections, each with its JSON, are kept; when this returns they are on the disk.
 
         Args:
             along: given the ids, what is kept with the detections, or not at all.
+            thumbnails: one for each detection, or none at all.
 
         Raises:
             Problem: 503 ``store_...``: they were not kept, or nobody knows.
@@ -127,8 +133,8 @@ class ResultKeeper:
             return []
         self.require_usable()
         records = [
-            record_of(detection, body, self._new_id(), stream_id=stream_id, session_id=session_id)
-            for detection, body in detections
+            record_of(detection, body, self._new_id(), stream_id=stream_id, session_id=session_id, thumbnail=thumbnail)
+            for (detection, body), thumbnail in zip_longest(detections, thumbnails)
         ]
         try:
             await self._committed(records, along([record.id for record in records]))
@@ -156,6 +162,14 @@ class ResultKeeper:
             Problem: 503 ``store_...``.
         """
         return await self.read(lambda: self._store.get(detection_id))
+
+    async def thumbnail(self, detection_id: str) -> bytes | None:
+        """The image file beside a detection; None: there is none (any more).
+
+        Raises:
+            Problem: 503 ``store_...``.
+        """
+        return await self.read(lambda: self._store.thumbnail(detection_id))
 
     async def page(self, request: PageRequest) -> tuple[list[StoredDetection], str | None]:
         """Detections, and the cursor behind them where there are more.
@@ -258,8 +272,15 @@ class ResultKeeper:
         age_s, size = self._settings.store_max_age_s, self._settings.store_max_bytes
         while True:
             if self._failure is None or self._failure.code == "store_full":
+                by_age_s = age_s if self._clock.is_believed() else None
                 try:
-                    deleted = await self.read(lambda: self._store.prune(max_age_s=age_s, max_bytes=size))
+                    prune = partial(
+                        self._store.prune,
+                        max_age_s=by_age_s,
+                        max_bytes=size,
+                        thumbnail_max_bytes=self._settings.thumbnail_max_bytes,
+                    )
+                    deleted = await self.read(prune)
                 except Problem as problem:
                     logger.warning("store_not_pruned", extra={"code": problem.code})
                 except Exception:  # as above

@@ -99,6 +99,25 @@ EXPORT_OPERATION: Final[dict[str, Any]] = {
 GET_OPERATION: Final[dict[str, Any]] = {
     "responses": {200: _ONE_ANSWER, **problems({404: _UNKNOWN, 500: _INTERNAL, 501: _NONE, 503: STORE_GONE})},
 }
+_NO_THUMBNAIL: Final[Fault] = (
+    "thumbnail_not_found",
+    "expected the id of a stored detection with a thumbnail, found '17'",
+    None,
+)
+THUMBNAIL_OPERATION: Final[dict[str, Any]] = {
+    "responses": {
+        200: {
+            "description": "JPEG, longest side at most 320 px",
+            "content": {"image/jpeg": {"schema": {"type": "string", "contentMediaType": "image/jpeg"}}},
+            "headers": {
+                name: {"description": text, "schema": {"type": "string"}}
+                for name, text in (("ETag", "of this picture"), ("Cache-Control", "it never changes"))
+            },
+        },
+        304: {"description": "The picture that If-None-Match names is still the one"},
+        **problems({404: _NO_THUMBNAIL, 500: _INTERNAL, 501: _NONE, 503: STORE_GONE}),
+    },
+}
 DETECTION_ID_HEADER: Final = "X-Detection-ID"
 
 
@@ -110,8 +129,9 @@ def add_store_openapi(app: FastAPI) -> None:
         paths = document["paths"]
         for path, example in (("/detections", EXAMPLE_PAGE), ("/detections/{detection_id}", EXAMPLE_STORED)):
             paths[path]["get"]["responses"]["200"]["content"]["application/json"]["example"] = example
-        (one,) = paths["/detections/{detection_id}"]["get"]["parameters"]
-        one["schema"] = DETECTION_ID_SCHEMA
+        for path in ("/detections/{detection_id}", "/detections/{detection_id}/thumbnail"):
+            (one,) = paths[path]["get"]["parameters"]
+            one["schema"] = DETECTION_ID_SCHEMA
         paths["/detect"]["post"]["responses"]["200"]["headers"] = {
             DETECTION_ID_HEADER: {
                 "description": "under which the detection is stored; absent without a store",

@@ -102,6 +102,11 @@ def detection_not_found(text: str) -> Problem:
     return Problem(404, code="detection_not_found", detail=f"expected the id of a stored detection, found {text!r:.80}")
 
 
+def thumbnail_not_found(text: str) -> Problem:
+    detail = f"expected the id of a stored detection with a thumbnail, found {text!r:.80}"
+    return Problem(404, code="thumbnail_not_found", detail=detail)
+
+
 def _filter(given: dict[str, str]) -> DetectionFilter:
     from_ns, to_ns = time_parameters(given)
     score = given.get("min_score")

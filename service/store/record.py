@@ -48,6 +48,7 @@ class Record:
         body: the detection's JSON, the very text that was answered.
         top_scores: label -> highest score of its regions, as the JSON has it.
         stream_id, session_id: None for ``POST /detect``.
+        thumbnail: an image file; None: there is none.
     """
 
     id: str
@@ -57,6 +58,7 @@ class Record:
     top_scores: dict[str, float] = field(default_factory=dict)
     stream_id: str | None = None
     session_id: str | None = None
+    thumbnail: bytes | None = None
 
     @property
     def size_bytes(self) -> int:
@@ -84,7 +86,13 @@ class StoredDetection:
 
 
 def record_of(
-    detection: Detection, body: str, new_id: str, *, stream_id: str | None = None, session_id: str | None = None
+    detection: Detection,
+    body: str,
+    new_id: str,
+    *,
+    stream_id: str | None = None,
+    session_id: str | None = None,
+    thumbnail: bytes | None = None,
 ) -> Record:
     """What is stored of a detection whose JSON is ``body``."""
     top_scores: dict[str, float] = {}
@@ -99,4 +107,5 @@ def record_of(
         top_scores=top_scores,
         stream_id=stream_id,
         session_id=session_id,
+        thumbnail=thumbnail,
     )

@@ -11,6 +11,7 @@ from sqlalchemy import (
     ForeignKey,
     Index,
     Integer,
+    LargeBinary,
     MetaData,
     String,
     Table,
@@ -46,6 +47,15 @@ LABELS: Final = Table(
     Column("label", String(64), primary_key=True),
     Column("top_score", Float, nullable=False),
 )
+
+THUMBNAILS: Final = Table(
+    "thumbnails",
+    METADATA,
+    Column("detection_id", ID_TYPE, ForeignKey("detections.id", ondelete="CASCADE"), primary_key=True),
+    Column("size_bytes", Integer, nullable=False),
+    Column("image", LargeBinary, nullable=False),
+)
+Index("thumbnails_by_size", THUMBNAILS.c.detection_id, THUMBNAILS.c.size_bytes)
 
 PROBE: Final = Table(
     "store_probe",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import time
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from typing import Any
 
@@ -12,6 +13,7 @@ from viflow_anomaly_service.detector_pool import DeadlinePassedError
 from viflow_anomaly_service.models.table import ModelSet
 from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.service_core import ServiceCore
+from viflow_anomaly_service.stage_times import StageTime
 from viflow_anomaly_service.store.query import STREAM_ID
 from viflow_anomaly_service.streams.table import LiveStream
 from viflow_anomaly_service.streams.work import JudgedCall, Reading, StreamWork
@@ -57,6 +59,7 @@ async def answer_call(
     receive: Callable[[], Awaitable[Reading]],
     while_connected: Callable[[Coroutine[Any, Any, bytes]], Awaitable[bytes]],
     log: dict[str, Any],
+    stages: list[StageTime],
 ) -> bytes:
     """The answer's bytes.
 
@@ -65,6 +68,7 @@ async def answer_call(
         receive: called once there is a place for what is sent.
         while_connected: awaits its argument, and raises if the client goes away.
         log: told what the call came to.
+        stages: told of those that are over.
 
     Raises:
         Problem: the call is refused, or something is wrong with it; the stream then stays where it was.
@@ -87,19 +91,26 @@ async def answer_call(
         except DeadlinePassedError as err:
             raise core.gate.shed("deadline", f"no turn came within {settings.queue_timeout_s:g} s") from err
         finally:
+            stages.extend(work.stages)
             log.update(work.log)
 
 
 async def _judged_and_kept(core: ServiceCore, stream: LiveStream, work: StreamWork) -> bytes:
     """Cancelled before the call is judged, nothing has happened; after that it is finished, whoever has gone."""
     judged = await core.pool.run(work, within_s=core.settings.queue_timeout_s)
+    started = time.perf_counter()
     finishing = asyncio.ensure_future(_kept(core, stream, judged))
     try:
-        return await asyncio.shield(finishing)
+        answer = await asyncio.shield(finishing)
     except asyncio.CancelledError:
         with contextlib.suppress(Problem):
             await finishing
         raise
+    if core.keeper is not None:
+        stored_s = time.perf_counter() - started
+        core.metrics.observe_stage("store", stored_s)
+        work.stages.append(StageTime.until_now("store", stored_s))
+    return answer
 
 
 def _show(core: ServiceCore, stream: LiveStream, judged: JudgedCall, ids: Sequence[str] | None) -> None:
@@ -122,7 +133,11 @@ async def _kept(core: ServiceCore, stream: LiveStream, judged: JudgedCall) -> by
     if core.keeper is not None:
         pairs = list(zip(step.detections, judged.bodies, strict=True))
         ids = await core.keeper.keep(
-            pairs, stream_id=stream.stream_id, session_id=stream.session_id, along=noticed.kept_along
+            pairs,
+            stream_id=stream.stream_id,
+            session_id=stream.session_id,
+            along=noticed.kept_along,
+            thumbnails=judged.thumbnails,
         )
     begun = stream.begun is None
     core.streams.advance(stream, judged.begun, step)

@@ -12,6 +12,7 @@ from viflow_anomaly_service.detect_endpoint import JSON_MEDIA_TYPE, accepted_con
 from viflow_anomaly_service.request_body import RequestBody, answered
 from viflow_anomaly_service.request_log import log_fields
 from viflow_anomaly_service.service_core import ServiceCore
+from viflow_anomaly_service.stage_times import StageTime, stage_times
 from viflow_anomaly_service.streams.calls import answer_call, require_callable, require_one_process
 from viflow_anomaly_service.streams.openapi import (
     DELETE_OPERATION,
@@ -35,11 +36,14 @@ def add_streams(app: FastAPI, core: ServiceCore) -> None:
         async with answered(body):
             models = require_callable(core, stream_id)
             content_type, settings = accepted_content_type(request), core.settings
+            stages = stage_times(request.scope)
 
             async def receive() -> Reading:
                 started = time.perf_counter()
                 data = await body.read(max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
-                core.metrics.observe_stage("upload", time.perf_counter() - started)
+                uploaded_s = time.perf_counter() - started
+                core.metrics.observe_stage("upload", uploaded_s)
+                stages.append(StageTime.until_now("upload", uploaded_s))
                 return partial(read_input, data, content_type, settings)
 
             answer = await answer_call(
@@ -49,6 +53,7 @@ def add_streams(app: FastAPI, core: ServiceCore) -> None:
                 receive=receive,
                 while_connected=body.while_connected,
                 log=log_fields(request.scope),
+                stages=stages,
             )
         return Response(answer, media_type=JSON_MEDIA_TYPE)
 

@@ -190,6 +190,7 @@ class StreamSocket:
             receive=receive,
             while_connected=lambda work: unless_gone(work, self._inbox.left.wait()),
             log=log,
+            stages=[],  # spans are of HTTP requests
         )
 
     def _problem(self, problem: Problem, message_id: int | str | None, request_id: str) -> dict[str, Any]:

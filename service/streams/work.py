@@ -24,8 +24,10 @@ from viflow_anomaly_service.metrics import ServiceMetrics, Stage
 from viflow_anomaly_service.models.table import LoadedModel, ModelSet
 from viflow_anomaly_service.problems import Problem, problem_of_error, problem_of_validation
 from viflow_anomaly_service.settings import ServiceSettings
+from viflow_anomaly_service.stage_times import StageTime
 from viflow_anomaly_service.streams.request import StreamInput
 from viflow_anomaly_service.streams.schemas import StreamSetup
+from viflow_anomaly_service.thumbnails import wanted_thumbnail
 
 Reading = Callable[[], StreamInput]
 """Of what one call sent; it may take a while, and raises Problem."""
@@ -50,6 +52,7 @@ class JudgedCall:
         step: the state behind it, detections and faults.
         bodies: the detections' JSON.
         pairs: what each of them was made from.
+        thumbnails: the pictures that are kept beside them.
     """
 
     received: StreamInput
@@ -57,6 +60,7 @@ class JudgedCall:
     step: StreamStep
     bodies: list[str]
     pairs: list[JudgedPair]
+    thumbnails: list[bytes | None]
 
 
 class _Analyzing(Protocol):
@@ -111,6 +115,7 @@ class StreamWork:
 
     Attributes:
         log: what the request's log line says of it.
+        stages: those that are over.
     """
 
     def __init__(
@@ -130,6 +135,7 @@ class StreamWork:
         self._settings = settings
         self._metrics = metrics
         self.log: dict[str, Any] = {}
+        self.stages: list[StageTime] = []
 
     def __call__(self, job: Job[JudgedCall]) -> JudgedCall:
         """The call judged.
@@ -151,6 +157,7 @@ class StreamWork:
         job.require_wanted()
         with self._stage("encode"):
             bodies = [to_json(detection) for detection in step.detections]
+            thumbnails = self._thumbnails(received, step)
         for detection in step.detections:
             self._metrics.observe_detection(detection, begun.model.name)
         self.log |= {"pairs": len(bodies), "faults": len(step.faults)}
@@ -159,7 +166,12 @@ class StreamWork:
             JudgedPair(pair, detector, detection, body, signs)
             for (pair, signs), detection, body in zip(observed.seen, step.detections, bodies, strict=True)
         ]
-        return JudgedCall(received, begun, step, bodies, pairs)
+        return JudgedCall(received, begun, step, bodies, pairs, thumbnails)
+
+    def _thumbnails(self, received: StreamInput, step: StreamStep) -> list[bytes | None]:
+        frames = (*self._state.frames, *(() if received.frame is None else (received.frame,)))
+        images = {frame.timestamp_ns: frame.image for frame in frames}
+        return [wanted_thumbnail(self._settings, images[one.source_timestamp_ns], one) for one in step.detections]
 
     def _stream_of(self, received: StreamInput) -> BegunStream:
         said = received.setup
@@ -185,6 +197,7 @@ class StreamWork:
     def _note(self, stage: Stage, seconds: float) -> None:
         self._metrics.observe_stage(stage, seconds)
         self.log[f"{stage}_ms"] = round(seconds * 1e3, 3)
+        self.stages.append(StageTime.until_now(stage, seconds))
 
 
 def new_stream(models: ModelSet, received: StreamInput, settings: ServiceSettings) -> BegunStream:

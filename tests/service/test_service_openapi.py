@@ -82,6 +82,7 @@ def test_operation_ids_are_stable(document: dict[str, Any]) -> None:
         ("/events/live", "get"): "liveEvents",
         ("/events/deliveries", "get"): "listDeliveries",
         ("/events/deliveries/{delivery_id}/retry", "post"): "retryDelivery",
+        ("/detections/{detection_id}/thumbnail", "get"): "getThumbnail",
         ("/streams", "get"): "listStreams",
         ("/streams/{stream_id}", "get"): "getStream",
         ("/streams/{stream_id}", "delete"): "deleteStream",
