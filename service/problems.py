@@ -165,8 +165,11 @@ def install_problem_handlers(app: FastAPI) -> None:
 
 
 def _allowed_methods(request: Request) -> str:
-    """Of all routes of this path: each route for itself knows its own only."""
-    found = [route for route in request.app.router.routes if route.matches(request.scope)[0] is not Match.NONE]
+    """Of all routes with the path's own template: each route for itself knows its own only. A name that also fits where
+    another template has a parameter (``/models/default``) is what it is called, not that parameter."""
+    matching = [route for route in request.app.router.routes if route.matches(request.scope)[0] is not Match.NONE]
+    own = min((getattr(route, "path", "") for route in matching), key=lambda path: (path.count("{"), path), default="")
+    found = [route for route in matching if getattr(route, "path", "") == own]
     return ", ".join(sorted({method for route in found for method in getattr(route, "methods", None) or ()}))
 
 
