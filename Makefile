@@ -20,6 +20,8 @@ TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 DEMO_SAMPLE ?= samples/drone
 DEMO_OUT ?= demo-output
 COVERAGE_FLOOR ?= 90
+# Each may load a model of its own.
+TEST_PROCESSES ?= 4
 # In an environment of their own, so that neither is part of what it looks at.
 AUDIT := $(VENV)/audit
 AUDIT_TOOLS := pip-audit==2.10.1 cyclonedx-bom==7.5.0
@@ -77,7 +79,8 @@ lint: $(VENV)/.installed-dev
 test: $(VENV)/.installed-dev
 	.ci/system-packages
 	$(MAKE) --no-print-directory lint
-	$(BIN)/python -m pytest --cov --cov-branch --cov-report=term --cov-fail-under=$(COVERAGE_FLOOR)
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses $(TEST_PROCESSES) --dist loadfile \
+	  --cov --cov-branch --cov-report=term --cov-fail-under=$(COVERAGE_FLOOR)
 
 wheel: $(VENV)/.installed
 	rm -rf build dist
