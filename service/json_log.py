@@ -27,6 +27,10 @@ class JsonLineFormatter(logging.Formatter):
         return json.dumps(line, default=str)
 
 
+_TELLS_ADDRESSES: Final = ("httpx", "httpcore")
+"""They write down whom they ask, with the passwords that an address may hold."""
+
+
 def configure_logging(level: str) -> None:
     """Send this process's log to stderr, one JSON object a line; called once, at the start of the server process."""
     handler = logging.StreamHandler()
@@ -34,3 +38,5 @@ def configure_logging(level: str) -> None:
     root = logging.getLogger()
     root.handlers = [handler]
     root.setLevel(level.upper())
+    for name in _TELLS_ADDRESSES:
+        logging.getLogger(name).setLevel(logging.WARNING)

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 from starlette.routing import Match
 
+from viflow_anomaly.config import fault_text
 from viflow_anomaly.errors import (
     ConfigError,
     InvalidInputError,
@@ -142,7 +143,7 @@ def problem_of_validation(err: ValidationError, prefix: str | None = None) -> Pr
         steps = [str(step) for step in fault["loc"]]
         place = ".".join(([prefix] if prefix else []) + steps)[:MAX_TEXT]
         code = _CODE_OF_FAULT.get(fault["type"], "field_invalid")
-        faults.append({"code": code, "field": place or None, "detail": fault["msg"]})
+        faults.append({"code": code, "field": place or None, "detail": fault_text(fault["type"], fault["msg"])})
     first = faults[0]
     detail = "; ".join(f"{fault['field'] or '(root)'}: {fault['detail']}" for fault in faults)
     return Problem(422, code=str(first["code"]), detail=detail, field=first["field"], faults=faults[1:])

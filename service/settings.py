@@ -8,9 +8,9 @@ from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Final, Literal, NamedTuple, Self
 
 from pydantic import (
+    AfterValidator,
     BeforeValidator,
     Field,
-    NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
     PositiveInt,
@@ -37,6 +37,7 @@ from viflow_anomaly_service.models.named import ModelName, NamedModel
 MEBIBYTE = 1024 * 1024
 MAX_WORKERS: Final = 256
 _ORIGIN: Final = re.compile(r"https?://[A-Za-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-f:]+\](:\d{1,5})?")
+_MASKED: Final = re.compile(r"\*+|[a-z0-9+]+://[^/]*:\*+@.*")
 _CAMERA: Final = re.compile(
     r"(?P<width>[1-9]\d{1,4})x(?P<height>[1-9]\d{1,4})(@(?P<focal>[1-9]\d{0,5}(\.\d+)?))?", re.ASCII
 )
@@ -90,8 +91,19 @@ def _texts(value: Any) -> Any:
 ThumbnailChoice = Literal["none", "motion", "all"]
 Origins = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_origins)]
 Score = Annotated[float, Field(ge=0, le=1)]
+EventSeconds = Annotated[float, Field(ge=0, le=86_400)]
 Topic = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*$", max_length=100)]
-Secrets = Annotated[tuple[SecretStr, ...], NoDecode, BeforeValidator(_texts)]
+
+
+def _shown(value: SecretStr) -> SecretStr:
+    """A secret; what `config` shows in its place is none."""
+    if _MASKED.fullmatch(value.get_secret_value()):
+        raise ValueError("expected the secret itself, found the stars that `config` shows in its place")
+    return value
+
+
+Secret = Annotated[SecretStr, AfterValidator(_shown)]
+Secrets = Annotated[tuple[Secret, ...], NoDecode, BeforeValidator(_texts)]
 Cameras = Annotated[tuple[WarmUpCamera, ...], NoDecode, BeforeValidator(_cameras)]
 _EUROC: Final = (WarmUpCamera(752, 480, None), WarmUpCamera(752, 480, 458.0))
 
@@ -143,7 +155,7 @@ class ServiceSettings(BaseSettings):
     allowed_origins: Origins = Field(default=(), description="sites whose pages may ask (CORS)")
     shutdown_timeout_s: PositiveInt = Field(default=20, description="time for running requests after SIGTERM")
     warm_up: Cameras = Field(default=_EUROC, description="WIDTHxHEIGHT[@FOCAL] of what is judged before it is ready")
-    store_url: SecretStr | None = Field(
+    store_url: Secret | None = Field(
         default=None, description="where detections stay: a path or sqlite:////path, or postgresql://...; none: nowhere"
     )
     store_max_age_s: PositiveFloat | None = Field(default=None, description="older detections are deleted")
@@ -166,15 +178,15 @@ class ServiceSettings(BaseSettings):
     event_start_score: Score = Field(default=0.5, description="of a track, from which on it begins an event")
     event_start_pairs: int = Field(default=3, ge=1, le=1000, description="judged pairs in a row with that score")
     event_end_score: Score = Field(default=0.3, description="below which, or unseen, a track ends its event")
-    event_end_s: NonNegativeFloat = Field(default=2.0, description="for so long, in camera time")
-    event_update_s: NonNegativeFloat = Field(default=1.0, description="at least between two messages of one event")
-    event_cooldown_s: NonNegativeFloat = Field(default=2.0, description="after an end none begins in the stream")
+    event_end_s: EventSeconds = Field(default=2.0, description="for so long, in camera time")
+    event_update_s: EventSeconds = Field(default=1.0, description="at least between two messages of one event")
+    event_cooldown_s: EventSeconds = Field(default=2.0, description="after an end none begins in the stream")
     event_ring: int = Field(default=1024, ge=1, le=100_000, description="events kept in memory without a store")
     max_event_readers: PositiveInt = Field(default=64, description="connections to /events/live at once")
     event_delivery_attempts: int = Field(default=15, ge=1, le=1000, description="then an event is a dead letter")
     webhook_urls: Secrets = Field(default=(), description="who is posted every event: https://a.example/hook,...")
-    webhook_secret: SecretStr | None = Field(default=None, description="signs what is posted")
-    mqtt_url: SecretStr | None = Field(default=None, description="broker: mqtt:// or mqtts://user:password@host:port")
+    webhook_secret: Secret | None = Field(default=None, description="signs what is posted")
+    mqtt_url: Secret | None = Field(default=None, description="broker: mqtt:// or mqtts://user:password@host:port")
     mqtt_prefix: Topic = Field(default="viflow", description="ahead of all topics of this service, and of no other")
     mqtt_discovery_prefix: Topic = Field(default="homeassistant", description="where Home Assistant looks")
     mqtt_ca_file: UsablePath | None = Field(default=None, description="whom mqtts:// trusts; not given: as the system")

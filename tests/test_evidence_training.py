@@ -263,7 +263,7 @@ def test_a_head_is_not_a_network_and_says_so(tmp_path: Path) -> None:
     bundled = Path(__file__).parent.parent / "viflow_anomaly" / "weights" / "viflow-calibrated.safetensors"
     with pytest.raises(CheckpointError, match="head") as caught:
         read_tensors(bundled, EvidenceRecord)
-    assert caught.value.code == "checkpoint_record_invalid"
+    assert caught.value.code == "checkpoint_of_other_kind"
 
 
 # --- scores

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from skimage.measure import label
 
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.peaks import MAX_DIVIDED, divided_at_valleys
@@ -79,6 +80,20 @@ def test_a_picture_full_of_specks_is_left_alone() -> None:
     things = np.kron(np.arange(MAX_DIVIDED + 1, dtype=np.intp) + 1, np.ones((12, 12), dtype=np.intp))
     motion = np.random.default_rng(0).uniform(0.5, 1, things.shape).astype(np.float32)
     assert divided_at_valleys(things, motion) is things
+
+
+def test_so_many_parts_and_hardly_more() -> None:
+    """Eight things of sixteen parts each."""
+    one = np.full((100, 100), 0.55, np.float32)
+    for row in range(2, 100, 25):
+        for column in range(2, 100, 25):
+            one[row : row + 21, column : column + 21] = 0.999
+    assert divided_at_valleys(things_of(one), one).max() == 16
+    motion = np.tile(np.pad(one, 2), (2, 4))
+    things = np.asarray(label(motion > 0.5), dtype=np.intp)
+    parts = divided_at_valleys(things, motion)
+    assert MAX_DIVIDED <= parts.max() < MAX_DIVIDED + 16
+    assert np.array_equal(parts > 0, things > 0)
 
 
 @given(seed=st.integers(0, 2**32 - 1), sigma=st.floats(0.1, 3.0))

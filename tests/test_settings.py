@@ -132,7 +132,7 @@ def test_a_section_may_be_one_json_variable() -> None:
     ],
 )
 def test_an_unknown_key_is_refused_with_its_layer(layer: dict[str, object], where: str) -> None:
-    with pytest.raises(ConfigError, match=f"^{where}: detector.regions.typo: Extra inputs") as caught:
+    with pytest.raises(ConfigError, match=f"^{where}: detector.regions.typo: there is no such field") as caught:
         resolve_settings(**layer)  # type: ignore[arg-type]
     assert caught.value.code == "config_invalid"
     assert caught.value.field == "detector.regions.typo"

@@ -64,8 +64,13 @@ def describe_validation(err: ValidationError) -> str:
     for problem in err.errors():
         place = ".".join(str(step) for step in problem["loc"]) or "(root)"
         found = "" if problem["type"] == "missing" else f", found {problem.get('input')!r:.80}"
-        parts.append(f"{place}: {problem['msg']}{found}")
+        parts.append(f"{place}: {fault_text(problem['type'], problem['msg'])}{found}")
     return "; ".join(parts)
+
+
+def fault_text(kind: str, message: str) -> str:
+    """What pydantic says of a fault, in words for those who do not know it."""
+    return "there is no such field" if kind == "extra_forbidden" else message
 
 
 class ImageLimits(FrozenConfig):

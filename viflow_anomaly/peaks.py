@@ -26,7 +26,7 @@ MIN_BOX_PX = 4 * MIN_PART_PX
 SAMPLES = 4096
 """Of a thing's box, evenly spread: more would say where it falls apart no better than to a few pixels."""
 MAX_DIVIDED = 64
-"""A picture full of specks has nothing to divide."""
+"""A picture full of specks has nothing to divide, and no picture holds more than so many parts that are worth it."""
 
 
 def divided_at_valleys(things: LabelArray, motion: Float32Array) -> LabelArray:
@@ -43,7 +43,7 @@ def divided_at_valleys(things: LabelArray, motion: Float32Array) -> LabelArray:
         return things
     divided, made = things, len(boxes)
     waiting = [(number, 0, box) for number, box in enumerate(boxes, start=1) if box is not None]
-    while waiting:
+    while waiting and made < MAX_DIVIDED:
         number, first, box = waiting.pop()
         own = divided[box] == number
         if own.size < MIN_BOX_PX:

@@ -67,8 +67,8 @@ def inside(folder: Path, name: str, *, field: str) -> Path:
     if plain and not steps.is_absolute() and ".." not in steps.parts and steps.parts:
         root = folder.resolve()
         path = (root / steps).resolve()
-        if path.is_relative_to(root) and path != root:
-            return path
+        if path.is_relative_to(root) and path != root and (path.is_file() or not path.exists()):
+            return path  # no pipe or device, whose reading would not end
     detail = f"{field}: expected the name of a file {_FILE}, found {name!r:.80}"
     raise Problem(422, code="model_path_invalid", detail=detail, field=field)
 

@@ -116,7 +116,10 @@ class ModelTable:
             loaded = [await self._made(name, settings_of_it) for name, settings_of_it in wanted.items()]
         except Exception as err:
             self._failed = True
-            logger.exception("model_load_failed")
+            expected = isinstance(err, ViflowError)  # a file that cannot be used, and no fault of the code's
+            logger.log(
+                logging.ERROR, "model_load_failed", extra={"cause": str(err)}, exc_info=None if expected else err
+            )
             self._on_failure(err)
             return
         self._current = ModelSet(tuple(loaded))

@@ -229,7 +229,7 @@ class ResultKeeper:
         except StoreError as err:
             failure = err
             self._count(err)
-        if (failure is None) != (self._failure is None):
+        if (failure and failure.code) != (self._failure and self._failure.code):
             event = "store_usable" if failure is None else "store_failed"
             level = logging.INFO if failure is None else logging.ERROR
             cause = None if failure is None else str(failure.__cause__)[:300]

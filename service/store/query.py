@@ -21,7 +21,8 @@ DEFAULT_LIMIT: Final = 100
 MAX_LIMIT: Final = 1000
 MAX_CURSOR: Final = 512
 LABELS: Final[tuple[str, ...]] = get_args(RegionLabel)
-STREAM_ID: Final = re.compile(r"[A-Za-z0-9._-]{1,64}", re.ASCII)
+STREAM_ID: Final = re.compile(r"(?!\.{1,2}$)[A-Za-z0-9._-]{1,64}", re.ASCII)
+"""Not what stands for a folder in a path: browsers fold it away."""
 DETECTION_ID: Final = re.compile(r"[0-9a-f]{32}", re.ASCII)
 Order = Literal["desc", "asc"]
 ORDERS: Final[tuple[str, ...]] = get_args(Order)

@@ -105,3 +105,17 @@ def test_checkpoints_that_cannot_be_used(
 
 def test_a_checkpoint_that_is_not_there(pair: PairFolder, capsys: pytest.CaptureFixture[str]) -> None:
     assert answer_to(pair.arguments("--checkpoint", "nowhere.safetensors"), capsys).is_refusal("nowhere.safetensors")
+
+
+def test_scores_are_fitted_by_a_command_that_says_on_how_much(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    samples, out = Path(__file__).parents[2] / "samples", tmp_path / "rescored.safetensors"
+    answer = answer_to(["fit-scores", str(samples), "--out", str(out)], capsys)
+    assert answer.code == 0
+    assert answer.out == f"{out}\n"
+    assert "regions in 1 recordings" in answer.err
+    assert "scores may be far off" in answer.err
+    assert out.is_file()
+    nothing = answer_to(["fit-scores", str(tmp_path / "no"), "--out", str(out)], capsys)
+    assert nothing.is_refusal("expected a folder of recordings, found nothing there")

@@ -290,13 +290,14 @@ def test_memory_is_bounded(server: LiveServer, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["/etc/passwd", "../a.json", "a/../../b", "", ".", "link", "linked/a.json", "a\\b", "a\0b", "x" * 600],
+    ["/etc/passwd", "../a.json", "a/../../b", "", ".", "link", "linked/a.json", "pipe", "a\\b", "a\0b", "x" * 600],
 )
 def test_no_way_out_of_the_folder(server: LiveServer, tmp_path: Path, name: str) -> None:
     (tmp_path / "outside").mkdir()
     write_model(tmp_path / "outside", "a.json")
     (tmp_path / "models" / "link").symlink_to(tmp_path / "outside" / "a.json")
     (tmp_path / "models" / "linked").symlink_to(tmp_path / "outside")
+    os.mkfifo(tmp_path / "models" / "pipe")
     for place in ("checkpoint", "evidence_head", "calibration"):
         body = {"checkpoint": "a.json", place: name}
         answer = put_model(server, "x", **body)

@@ -96,6 +96,8 @@ def test_configure_logging_replaces_the_handlers(monkeypatch: pytest.MonkeyPatch
         configure_logging("warning")
         assert [type(handler.formatter) for handler in root.handlers] == [JsonLineFormatter]
         assert root.level == logging.WARNING
+        configure_logging("info")
+        assert not logging.getLogger("httpx").isEnabledFor(logging.INFO)  # it tells whom it asks, passwords included
     finally:
         root.setLevel(level)
 

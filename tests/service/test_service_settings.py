@@ -150,3 +150,11 @@ def test_a_wrong_value_of_the_file_is_refused_where_the_environment_hides_it(mon
     monkeypatch.setenv("VIFLOW_MAX_QUEUED", "7")
     with pytest.raises(ConfigError, match=r"configuration file, \[service\].*max_queued"):
         load_settings({"max_queued": -1})
+
+
+@pytest.mark.parametrize("name", ["store_url", "webhook_secret", "mqtt_url"])
+@pytest.mark.parametrize("stars", ["***", "**********", "mqtt://user:***@broker:1883"])
+def test_what_config_shows_in_place_of_a_secret_is_none(name: str, stars: str) -> None:
+    with pytest.raises(ConfigError, match=f"{name}: .*expected the secret itself") as caught:
+        load_settings({name: stars})
+    assert caught.value.code == "config_invalid"

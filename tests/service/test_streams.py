@@ -261,7 +261,7 @@ def test_a_wrong_form_is_named(
     assert_problem(streaming.client.post("/streams/wrong/frames", files=parts), 422, code, field)
 
 
-@pytest.mark.parametrize("name", ["a b", "%C3%84", "a" * 65, "a%00"])
+@pytest.mark.parametrize("name", ["a b", "%C3%84", "a" * 65, "a%00", "%2e%2e"])
 def test_a_name_has_few_letters(streaming: LiveServer, world: World, name: str) -> None:
     assert_problem(post(streaming, name, call(world, 0)), 422, "stream_id_invalid", "stream_id")
     assert_problem(streaming.client.get(f"/streams/{name}"), 404, "stream_not_found", None)

@@ -59,6 +59,8 @@ def masked(value: Any, name: str = "") -> Any:
         return [masked(item, name) for item in value]
     if value is not None and _SECRET_NAME.search(name):
         return MASK
+    if isinstance(value, str) and value.strip("*") == "" and value:
+        return MASK  # a secret of the service's, which hides itself
     if isinstance(value, str):
         return _DSN_PASSWORD.sub(rf"\1={MASK}", _URL_PASSWORD.sub(rf"\1:{MASK}@", value))
     return value

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -16,6 +18,9 @@ from viflow_anomaly.cli.options import (
 )
 from viflow_anomaly.cli.progress import stderr_progress
 from viflow_anomaly.cli.train_evidence import recordings_in
+
+ENOUGH_REGIONS: Final = 100
+FEW: Final = f"; note: with fewer than {ENOUGH_REGIONS} that move, or that do not, scores may be far off"
 
 
 def fit_scores(
@@ -33,9 +38,11 @@ def fit_scores(
     The head (`evidence_head`, or the bundled one) keeps its weights. Of use where the network, the regions or the mix
     of scenes has changed: a score is a share, and holds for recordings like those that it was fitted on.
 
-    [bold]Example[/bold]
+    [bold]Examples[/bold]
 
-      viflow-anomaly fit-scores runs/calibration --out runs/head/rescored.safetensors
+      viflow-anomaly simulate --rig drone --seed 35000 --sequences 50 --frames 7 --out runs/calibration
+
+      viflow-anomaly fit-scores runs/calibration --out rescored.safetensors
     """
     settings = settings_from(config, assignments, {"checkpoint": checkpoint})
     # No head is loaded beside the network: the one whose scores are fitted judges every pair.
@@ -52,6 +59,10 @@ def fit_scores(
             out,
             report=lambda what, done, total: progress.update(task, description=what, completed=done, total=total),
         )
+    counts = json.loads(head.with_suffix(".json").read_text(encoding="utf-8"))["provenance"]["calibrated_on"]
+    told = f"fitted on {counts['regions']} regions in {len(folders)} recordings; {counts['moving']} of them move"
+    few = min(counts["moving"], counts["regions"] - counts["moving"]) < ENOUGH_REGIONS
+    print(f"{told}{FEW if few else ''}", file=sys.stderr)
     print(head)
 
 

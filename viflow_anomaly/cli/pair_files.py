@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import ConfigDict, Field, ValidationError
 
-from viflow_anomaly.config import FrozenConfig, ImageLimits
+from viflow_anomaly.config import FrozenConfig, ImageLimits, fault_text
 from viflow_anomaly.datasets.plain import read_camera, read_imu
 from viflow_anomaly.errors import DatasetError, InvalidInputError
 from viflow_anomaly.images import read_image
@@ -118,5 +118,7 @@ def _read_document(path: Path) -> ImuDocument:
         found = "" if problems[0]["type"] in ("json_invalid", "missing") else f", found {problems[0]['input']!r:.80}"
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         raise InvalidInputError(
-            f"{path}: {place}: {problems[0]['msg']}{found}{more}", code="imu_document_invalid", field=place
+            f"{path}: {place}: {fault_text(problems[0]['type'], problems[0]['msg'])}{found}{more}",
+            code="imu_document_invalid",
+            field=place,
         ) from err

@@ -90,7 +90,7 @@ def recordings_in(folder: Path) -> list[Path]:
     if not folder.is_dir():
         found = "a file" if folder.exists() else "nothing there"
         raise DatasetError(
-            f"{folder}: expected a folder of recordings for --calibration, found {found}",
+            f"{folder}: expected a folder of recordings, found {found}",
             code="directory_missing",
             field="calibration",
         )
