@@ -169,7 +169,8 @@ class DeliveryStore:
                 if thing in seen:
                     continue
                 seen.add(thing)  # the first message that the sink has not got says where it stands
-                (found.setdefault(stream, set()).discard if kind == "start" else found[stream].add)(thing)
+                things = found.setdefault(stream, set())
+                (things.discard if kind == "start" else things.add)(thing)
         return found
 
     def _select(self, conditions: Sequence[Any], limit: int | None, *, after: int) -> list[Delivery]:

@@ -15,6 +15,7 @@ import sqlalchemy as sa
 from alembic import command
 from alembic.config import Config
 
+from viflow_anomaly_service.events import delivery_store
 from viflow_anomaly_service.events.delivery_store import DeliveryStore
 from viflow_anomaly_service.events.event_record import EventRecord
 from viflow_anomaly_service.events.event_store import EventStore
@@ -210,6 +211,17 @@ def test_what_is_open_is_as_the_sink_was_told(events: EventStore, deliveries: De
     assert deliveries.open_things("mqtt") == {"hall": set(), "door": {"d-1"}}
     events.add([event("end", "d-1", at=1, stream="door"), event("start", "d-1", at=2, stream="door")])
     assert deliveries.open_things("mqtt") == {"hall": set(), "door": {"d-1"}}
+
+
+def test_what_is_open_is_known_beyond_the_newest_streams(
+    events: EventStore, deliveries: DeliveryStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(delivery_store, "KNOWN_STREAMS", 1)
+    events.add([event("start", "h-1")])
+    for one in deliveries.pending("mqtt", 1):
+        deliveries.note(one, "delivered", attempts=1, next_attempt_ns=0, error=None)
+    events.add([event("end", "h-1", at=1), event("start", "d-1", stream="door"), event("start", "y-1", stream="yard")])
+    assert deliveries.open_things("mqtt") == {"hall": {"h-1"}, "door": set(), "yard": set()}
 
 
 def test_a_store_of_the_first_version_is_brought_up_to_date(empty_store_url: str) -> None:
