@@ -102,12 +102,9 @@ class DeliveryStore:
         wanted = [DELIVERIES.c.state == state] if state is not None else []
         seq = DELIVERIES.c.event_seq
         events = sa.select(seq).where(*wanted, seq > after).distinct().order_by(seq).limit(limit + 1)
-        with self._store.transaction() as connection:
-            seqs = connection.execute(events).scalars().all()
-        if not seqs:
-            return [], False
-        last = seqs[:limit][-1]
-        return self._select([*wanted, seq <= last], None, after=after), len(seqs) > limit
+        found = self._select([*wanted, seq.in_(events)], None, after=after)  # one statement: nothing changes within it
+        seqs = sorted({one.seq for one in found})
+        return [one for one in found if one.seq in seqs[:limit]], len(seqs) > limit
 
     def get(self, event_id: str, sink: str) -> Delivery | None:
         found = self._select([EVENTS.c.event_id == event_id, DELIVERIES.c.sink == sink], 1, after=0)

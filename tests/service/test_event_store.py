@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -196,6 +198,33 @@ def test_deliveries_wait_in_order_until_they_are_noted(events: EventStore, deliv
     assert not deliveries.revive(dead)
     assert [(one.event, one.attempts) for one in deliveries.pending("mqtt", 9)] == [(told[1], 0), (told[2], 0)]
     assert deliveries.get("0" * 32, "mqtt") is None
+
+
+def test_a_page_is_whole_though_a_delivery_is_noted_meanwhile(
+    events: EventStore,
+    deliveries: DeliveryStore,
+    store: DetectionStore,
+    empty_store_url: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told = [event("start"), event("update", at=1)]
+    events.add(told)
+    first, _ = deliveries.pending("mqtt", 9)
+    other = DetectionStore(empty_store_url)
+    noting = DeliveryStore(other, holder="b" * 32)
+    begin = store.transaction
+
+    @contextlib.contextmanager
+    def noted_behind(*, writes: bool = False) -> Iterator[sa.Connection]:
+        with begin(writes=writes) as connection:
+            yield connection
+        for sink in SINKS:
+            noting.note(replace(first, sink=sink), "delivered", attempts=1, next_attempt_ns=0, error=None)
+
+    monkeypatch.setattr(store, "transaction", noted_behind)
+    found, more = deliveries.page("pending", 1, 0)
+    assert ([(one.event, one.sink) for one in found], more) == ([(told[0], sink) for sink in SINKS], True)
+    other.close()
 
 
 def test_what_is_open_is_as_the_sink_was_told(events: EventStore, deliveries: DeliveryStore) -> None:
