@@ -155,7 +155,7 @@ class Courier:
             await self._observe()
             due_s = LOOK_SECONDS
             for delivery in waiting:
-                due_s = (delivery.next_attempt_ns - time.time_ns()) / 1e9
+                due_s = _due_s(delivery)
                 if due_s > 0 or session.broken.is_set() or not await self._hold():
                     break
                 if not await self._attempt(session, delivery):
@@ -204,6 +204,12 @@ class Courier:
 
 
 _DELIVERED: DeliveryState = "delivered"
+
+
+def _due_s(delivery: Delivery) -> float:
+    """Seconds until the next attempt; what waits longer than anything may was noted by a clock that was ahead."""
+    due_s = (delivery.next_attempt_ns - time.time_ns()) / 1e9
+    return due_s if due_s <= LONGEST_WAIT_SECONDS else 0.0
 
 
 async def _first(*events: asyncio.Event, timeout_s: float) -> None:

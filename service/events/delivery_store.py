@@ -71,14 +71,17 @@ class DeliveryStore:
         """Become, or stay, the one process that delivers to a sink; False: another one is.
 
         Args:
-            seconds: after which another one may, unless this is called again.
+            seconds: after which another one may, unless this is called again; the same in all processes. What is held
+                for longer than twice that was held by a clock that was ahead.
         """
         now_ns = time.time_ns()
         values = {"holder": self._holder, "held_until_ns": now_ns + round(seconds * 1e9)}
         with self._store.transaction(writes=True) as connection:
             insert: Any = postgresql.insert if connection.dialect.name == "postgresql" else sqlite.insert
             taken = insert(SINKS).values(sink=sink, **values)
-            free = sa.or_(SINKS.c.holder == self._holder, SINKS.c.held_until_ns < now_ns)
+            until = SINKS.c.held_until_ns
+            held = until.between(now_ns, now_ns + round(2 * seconds * 1e9))
+            free = sa.or_(SINKS.c.holder == self._holder, sa.not_(held))
             taken = taken.on_conflict_do_update(index_elements=["sink"], set_=values, where=free)
             return connection.execute(taken.returning(SINKS.c.sink)).scalar() is not None
 

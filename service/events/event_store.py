@@ -38,6 +38,7 @@ class EventStore:
         store: whose database it is.
         sinks: names of those who are to be told of every event.
         holder: this process; what it has begun is its own for ``hold_s`` after ``hold_open``.
+        hold_s: the same in all processes. What is held for longer than twice that was held by a clock that was ahead.
     """
 
     def __init__(self, store: DetectionStore, *, sinks: Sequence[str], holder: str, hold_s: float) -> None:
@@ -120,16 +121,20 @@ class EventStore:
 
     def has_abandoned(self) -> bool:
         """Whether something is open that a process has begun which is no more."""
-        return self._some_open(OPEN_EVENTS.c.held_until_ns < time.time_ns())
+        return self._some_open(self._abandoned())
 
     def end_abandoned(self) -> int:
         """End what processes have begun that are no more; how many events that were."""
-        gone = sa.select(OPEN_EVENTS.c.body).where(OPEN_EVENTS.c.held_until_ns < time.time_ns())
+        gone = sa.select(OPEN_EVENTS.c.body).where(self._abandoned())
         with self._store.transaction(writes=True) as connection:
             bodies = connection.execute(gone.limit(ENDED_AT_ONCE)).scalars().all()
             ends = [ended(body, event_id=self._new_id(), reason="service_restarted") for body in bodies]
             self.insert(connection, ends)
         return len(ends)
+
+    def _abandoned(self) -> sa.ColumnElement[bool]:
+        now_ns = time.time_ns()
+        return sa.not_(OPEN_EVENTS.c.held_until_ns.between(now_ns, now_ns + 2 * self._hold_ns))
 
     def _some_open(self, condition: sa.ColumnElement[bool]) -> bool:
         with self._store.transaction() as connection:

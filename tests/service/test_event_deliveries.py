@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import hmac
 import json
+import sqlite3
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -84,6 +85,26 @@ def test_a_webhook_that_fails_is_tried_again_and_order_is_kept(tmp_path: Path) -
     name = webhook.webhook_name(receiver.url)
     assert f'viflow_event_deliveries_total{{result="refused",sink="{name}"}} 4.0' in text
     assert f'viflow_event_deliveries_total{{result="delivered",sink="{name}"}} 3.0' in text
+
+
+@pytest.mark.usefixtures("impatient")
+def test_what_waits_for_a_clock_that_was_ahead_goes_on(tmp_path: Path) -> None:
+    refusing = [True]
+    with webhook_receiver(lambda event: 500 if refusing[0] else 200) as receiver:
+        with posting(receiver, tmp_path) as server:
+            play(server.client, "hall", ONE_EVENT)
+            wait_until(lambda: deliveries(server)[0]["attempts"] > 0)
+        refusing[0] = False
+        with contextlib.closing(sqlite3.connect(tmp_path / "events.db")) as connection, connection:
+            ahead_ns = time.time_ns() + 3600 * 10**9
+            connection.execute("UPDATE event_deliveries SET next_attempt_ns = ?", (ahead_ns,))
+            held = (webhook.webhook_name(receiver.url), "d" * 32, ahead_ns)
+            connection.execute(
+                "INSERT OR REPLACE INTO event_sinks (sink, holder, held_until_ns) VALUES (?, ?, ?)", held
+            )
+        with posting(receiver, tmp_path):
+            wait_until(lambda: len(receiver.taken()) == 3, seconds=30)
+    assert kinds(receiver) == KINDS
 
 
 @pytest.mark.usefixtures("impatient")

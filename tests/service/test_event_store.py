@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
@@ -17,7 +17,7 @@ import sqlalchemy as sa
 from alembic import command
 from alembic.config import Config
 
-from viflow_anomaly_service.events import delivery_store
+from viflow_anomaly_service.events import delivery_store, event_store
 from viflow_anomaly_service.events.delivery_store import DeliveryStore
 from viflow_anomaly_service.events.event_record import EventRecord
 from viflow_anomaly_service.events.event_store import EventStore
@@ -50,6 +50,24 @@ def events(store: DetectionStore) -> EventStore:
 @pytest.fixture
 def deliveries(store: DetectionStore) -> DeliveryStore:
     return DeliveryStore(store, holder="a" * 32)
+
+
+@dataclass
+class Clock:
+    """The wall clock as events and deliveries see it."""
+
+    ahead_s: float = 0.0
+
+    def time_ns(self) -> int:
+        return time.time_ns() + round(self.ahead_s * 1e9)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr(delivery_store, "time", made)
+    monkeypatch.setattr(event_store, "time", made)
+    return made
 
 
 def event(kind: Any, thing: str = "t-1", *, at: int = 0, stream: str = "hall") -> EventRecord:
@@ -157,16 +175,28 @@ def test_what_a_dead_process_has_begun_is_ended_once(store: DetectionStore) -> N
     assert kinds(alive).count("end") == 2
 
 
-def test_who_lives_keeps_what_it_has_begun(store: DetectionStore) -> None:
-    events = EventStore(store, sinks=(), holder="a" * 32, hold_s=0.2)
+def test_who_lives_keeps_what_it_has_begun(store: DetectionStore, clock: Clock) -> None:
+    events = EventStore(store, sinks=(), holder="a" * 32, hold_s=30.0)
     events.add([event("start")])
-    keeping = EventStore(store, sinks=(), holder="a" * 32, hold_s=60.0)
-    keeping.hold_open()
-    time.sleep(0.25)
+    clock.ahead_s = 20.0
+    events.hold_open()
+    clock.ahead_s = 45.0
     assert not events.has_abandoned()
+    clock.ahead_s = 55.0
+    assert events.has_abandoned()
 
 
-def test_one_process_delivers_to_a_sink(store: DetectionStore) -> None:
+def test_what_a_clock_that_was_ahead_held_is_abandoned(store: DetectionStore, clock: Clock) -> None:
+    dead, alive = (EventStore(store, sinks=(), holder=name * 32, hold_s=30.0) for name in "da")
+    clock.ahead_s = 3600.0
+    dead.add([event("start", "d-1")])
+    assert not alive.has_abandoned()
+    clock.ahead_s = 0.0
+    assert alive.has_abandoned()
+    assert alive.end_abandoned() == 1
+
+
+def test_one_process_delivers_to_a_sink(store: DetectionStore, clock: Clock) -> None:
     one, other = (DeliveryStore(store, holder=name * 32) for name in "ab")
     assert one.hold("mqtt", 30.0)
     assert one.hold("mqtt", 30.0)
@@ -175,9 +205,19 @@ def test_one_process_delivers_to_a_sink(store: DetectionStore) -> None:
     other.release("mqtt")  # not its own
     assert not other.hold("mqtt", 30.0)
     one.release("mqtt")
-    assert other.hold("mqtt", 0.0)
-    time.sleep(0.01)
+    assert other.hold("mqtt", 30.0)
+    clock.ahead_s = 31.0
     assert one.hold("mqtt", 30.0)
+
+
+def test_a_sink_that_a_clock_that_was_ahead_held_is_free(store: DetectionStore, clock: Clock) -> None:
+    dead, alive = (DeliveryStore(store, holder=name * 32) for name in "da")
+    clock.ahead_s = 3600.0
+    assert dead.hold("mqtt", 30.0)
+    clock.ahead_s = 3595.0  # as clocks of replicas differ
+    assert not alive.hold("mqtt", 30.0)
+    clock.ahead_s = 0.0
+    assert alive.hold("mqtt", 30.0)
 
 
 def test_deliveries_wait_in_order_until_they_are_noted(events: EventStore, deliveries: DeliveryStore) -> None:
