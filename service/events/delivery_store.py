@@ -116,12 +116,13 @@ class DeliveryStore:
     def note(
         self, delivery: Delivery, state: DeliveryState, *, attempts: int, next_attempt_ns: int, error: str | None
     ) -> None:
-        """What an attempt came to."""
+        """What an attempt came to, unless another process has made one meanwhile."""
         one = (DELIVERIES.c.event_seq == delivery.seq, DELIVERIES.c.sink == delivery.sink)
+        same = (DELIVERIES.c.state == "pending", DELIVERIES.c.attempts == delivery.attempts)
         with self._store.transaction(writes=True) as connection:
             connection.execute(
                 sa.update(DELIVERIES)
-                .where(*one)
+                .where(*one, *same)
                 .values(
                     state=state,
                     attempts=attempts,

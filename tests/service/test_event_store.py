@@ -267,6 +267,20 @@ def test_a_page_is_whole_though_a_delivery_is_noted_meanwhile(
     other.close()
 
 
+def test_an_attempt_that_is_noted_late_changes_nothing(events: EventStore, deliveries: DeliveryStore) -> None:
+    events.add([event("start"), event("end", at=1)])
+    first, second = deliveries.pending("mqtt", 9)
+    deliveries.note(first, "delivered", attempts=1, next_attempt_ns=0, error=None)
+    deliveries.note(first, "dead", attempts=1, next_attempt_ns=0, error="late")
+    deliveries.note(second, "pending", attempts=1, next_attempt_ns=5, error="first")
+    deliveries.note(second, "pending", attempts=1, next_attempt_ns=9, error="late")
+    found, _ = deliveries.page(None, 9, 0)
+    assert [(one.state, one.last_error) for one in found if one.sink == "mqtt"] == [
+        ("delivered", None),
+        ("pending", "first"),
+    ]
+
+
 def test_what_is_open_is_as_the_sink_was_told(events: EventStore, deliveries: DeliveryStore) -> None:
     def tell(count: int) -> None:
         for one in deliveries.pending("mqtt", count):
