@@ -28,7 +28,7 @@ from viflow_anomaly_service.events.query import EventFilter
 from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.store.detection_store import DetectionStore
 from viflow_anomaly_service.store.engine import MIGRATIONS, make_engine, store_url
-from viflow_anomaly_service.store.record import IdMaker
+from viflow_anomaly_service.store.record import IdMaker, first_id_at, stored_at_ns
 
 NEW_ID = IdMaker()
 SINKS = ("mqtt", "webhook-000000000000")
@@ -76,6 +76,11 @@ def event(kind: Any, thing: str = "t-1", *, at: int = 0, stream: str = "hall") -
     return EventRecord(new_id, thing, kind, stream, at, json.dumps(body))
 
 
+def id_of_an_hour_ago(told: EventRecord) -> str:
+    earlier = first_id_at(stored_at_ns(told.event_id) - 3600 * 10**9)
+    return earlier + told.event_id[len(earlier) :]
+
+
 def kinds(events: EventStore) -> list[str]:
     return [one.event.kind for one in events.after(0, 1000)]
 
@@ -83,8 +88,8 @@ def kinds(events: EventStore) -> list[str]:
 def test_what_is_there_already_or_behind_its_end_is_left_out(events: EventStore) -> None:
     first = [event("start", at=1), event("update", at=2), event("end", at=3)]
     events.add(first)
-    events.add([event("start", at=1), event("update", at=2), event("end", at=3)])  # sent again
-    events.add([event("update", at=4), event("end", at=5)])  # of one that has ended
+    assert events.add([event("start", at=1), event("update", at=2), event("end", at=3)]) == []  # sent again
+    assert events.add([event("update", at=4), event("end", at=5)]) == []  # of one that has ended
     assert [one.event for one in events.after(0, 10)] == first
     events.add([event("start", at=6)])
     events.add([event("end", at=7)])
@@ -127,12 +132,13 @@ def test_the_place_of_an_event_that_is_gone_is_behind_those_before_it(
 ) -> None:
     told = [event("start", f"t-{k}") for k in range(3)]
     events.add(told)
-    assert events.seq_of(told[1].event_id) == events.after(0, 2)[1].seq
+    assert events.place_of(told[1].event_id) == Place(events.after(0, 2)[1].seq, gap=False)
     gone = NEW_ID()
     later = event("start", "t-9")
     events.add([later])
-    assert [one.event for one in events.after(events.seq_of(gone), 9)] == [later]
-    assert events.seq_of("0" * 32) == 0
+    place = events.place_of(gone)
+    assert ([one.event for one in events.after(place.seq, 9)], place.gap) == ([later], True)
+    assert events.place_of("0" * 32) == Place(0, gap=True)
 
 
 def test_numbers_are_not_given_again(events: EventStore, store: DetectionStore) -> None:
@@ -147,13 +153,12 @@ def test_numbers_are_not_given_again(events: EventStore, store: DetectionStore) 
 def test_events_and_their_deliveries_go_with_the_detections_of_their_time(
     events: EventStore, store: DetectionStore, deliveries: DeliveryStore
 ) -> None:
-    old = [event("start"), event("end")]
-    events.add(old)
-    time.sleep(0.05)
+    old = [replace(one, event_id=id_of_an_hour_ago(one)) for one in (event("start"), event("end"))]
     new = event("start", "t-2")
-    events.add([new])
-    store.prune(max_age_s=0.04, max_bytes=None)
-    assert [one.event for one in events.after(0, 9)] in ([new], [])
+    events.add([*old, new])
+    store.prune(max_age_s=1800.0, max_bytes=None)
+    assert [one.event for one in events.after(0, 9)] == [new]
+    assert [one.event for one in deliveries.pending("mqtt", 9)] == [new]
     store.prune(max_age_s=1e-6, max_bytes=None)
     assert deliveries.pending("mqtt", 9) == []
 
@@ -351,7 +356,8 @@ def test_a_reader_that_falls_behind_the_ring_is_told_of_the_gap() -> None:
 def test_the_ring_ends_what_has_begun_once() -> None:
     async def tell() -> list[str]:
         log = MemoryLog(9)
-        log.took([event("start"), event("end", at=1), event("end", at=2), event("update", at=3)])
+        told = [event("start"), event("end", at=1), event("end", at=2), event("update", at=3)]
+        assert log.took(told) == told[:2]
         found = await log.after(0, 9)
         assert found is not None
         return [one.event.kind for one in found]
