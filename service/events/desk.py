@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 RETRY_SECONDS: Final = 1.0
-FAREWELL_SECONDS: Final = 3.0
-"""For the ends of what is open when the service stops; what does not come through is ended by the next one."""
 
 
 @dataclass
@@ -139,16 +137,22 @@ class EventDesk:
                     logger.exception("event_ends_failed")
                     self._ends.popleft()
 
-    async def close(self, streams: Sequence[LiveStream]) -> None:
-        """The service stops: once no call is at work, and ``watch`` has ended."""
+    async def close(self, streams: Sequence[LiveStream], *, until: float) -> None:
+        """The service stops: once no call is at work, and ``watch`` has ended.
+
+        Args:
+            until: in the event loop's time; what is not kept then is ended by the next process.
+        """
         for stream in streams:
             self.end(stream, "service_stopped")
         try:
-            async with asyncio.timeout(FAREWELL_SECONDS):
+            async with asyncio.timeout_at(until):
                 while self._ends:
                     await self._keep_end()
         except (Problem, TimeoutError):
             logger.warning("event_ends_left", extra={"streams": len(self._ends)})
+        except Exception:  # a fault of ours, which must not keep the rest from being closed
+            logger.exception("event_ends_left")
 
     async def _keep_end(self) -> None:
         ending, reason = self._ends[0]
