@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 from typing import Any, Final
 
@@ -69,17 +69,18 @@ def create_app(
         if core.keeper is not None:
             core.keeper.start()
         core.events.start()
-        yield
-        core.gate.close()
-        for task in tasks:
-            task.cancel()
-        await core.models.close()
-        await asyncio.to_thread(core.pool.close)
-        await core.events.close(core.streams.begun())
-        if core.keeper is not None:
-            await core.keeper.close()
-        if tracing is not None:
-            await end_tracing(tracing)
+        async with AsyncExitStack() as closing:  # from the last line to the first, each whatever the others do
+            if tracing is not None:
+                closing.push_async_callback(end_tracing, tracing)
+            if core.keeper is not None:
+                closing.push_async_callback(core.keeper.close)
+            closing.push_async_callback(_close_events, core)
+            closing.push_async_callback(asyncio.to_thread, core.pool.close)
+            closing.push_async_callback(core.models.close)
+            for task in tasks:
+                closing.callback(task.cancel)
+            closing.callback(core.gate.close)
+            yield
 
     app = FastAPI(
         title="viflow-anomaly",
@@ -137,6 +138,10 @@ def _build(
         events=events,
         live=PairMemory(settings, metrics),
     )
+
+
+async def _close_events(core: ServiceCore) -> None:
+    await core.events.close(core.streams.begun())
 
 
 async def _watch_memory(metrics: ServiceMetrics) -> None:

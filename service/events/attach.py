@@ -36,8 +36,12 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 LOOK_SECONDS: Final = 1.0
-FAREWELL_SECONDS: Final = 2.0
-"""For the last events, those of the end itself, to be told before the service stops."""
+CLOSE_SECONDS: Final = 4.0
+"""For all that events need before the service stops; the store, which may hang, is closed after that."""
+ENDS_SECONDS: Final = 2.0
+"""Of these, for the ends of what is open to be kept; what does not come through is ended by the next process."""
+TOLD_SECONDS: Final = 3.0
+"""Of these, until sinks have been told of the ends: what is left is for them to be left in order."""
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
 
 
@@ -45,6 +49,13 @@ async def _ended(tasks: Sequence[asyncio.Task[None]]) -> None:
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _released(courier: Courier) -> None:
+    try:
+        await courier.release()
+    except Problem as problem:
+        logger.warning("event_sink_not_released", extra={"code": problem.code})
 
 
 @dataclass(frozen=True)
@@ -95,19 +106,21 @@ class EventParts:
         self._tasks = [asyncio.create_task(one) for one in work]
 
     async def close(self, streams: Sequence[LiveStream]) -> None:
-        """After the last request, before the store is closed."""
-        await _ended(self._tasks)
-        await self.desk.close(streams)
+        """After the last request, before the store is closed; takes ``CLOSE_SECONDS`` at most."""
+        began = asyncio.get_running_loop().time()
         couriers = self.stored.couriers if self.stored is not None else ()
-        with contextlib.suppress(Problem, TimeoutError):  # what is left waits in the store for the next process
-            async with asyncio.timeout(FAREWELL_SECONDS):
-                await asyncio.gather(*(courier.settle() for courier in couriers))
-        await _ended(self._courier_tasks)
-        for courier in couriers:
-            try:
-                await courier.release()
-            except Problem as problem:
-                logger.warning("event_sink_not_released", extra={"code": problem.code})
+        try:
+            async with asyncio.timeout_at(began + CLOSE_SECONDS):
+                await _ended(self._tasks)
+                await self.desk.close(streams, until=began + ENDS_SECONDS)
+                with contextlib.suppress(Problem, TimeoutError):  # what is left waits in the store for the next process
+                    async with asyncio.timeout_at(began + TOLD_SECONDS):
+                        await asyncio.gather(*(courier.settle() for courier in couriers))
+                await _ended(self._courier_tasks)
+                for courier in couriers:
+                    await _released(courier)
+        except TimeoutError:
+            logger.warning("events_not_closed_in_time")
 
     async def _look(self, log: StoreLog) -> None:
         """For events of other processes, while somebody reads live."""
@@ -118,6 +131,8 @@ class EventParts:
                     await log.look()
                 except Problem as problem:
                     logger.debug("events_not_watched", extra={"code": problem.code})
+                except Exception:  # a fault of ours, which must not end the watch
+                    logger.exception("events_not_watched")
 
 
 def configured_events(

@@ -21,8 +21,12 @@ from viflow_anomaly_service.store.record import stored_at_ns
 logger = logging.getLogger(__name__)
 
 HOLD_SECONDS: Final = 20.0
-"""For which a process keeps a sink to itself; longer than one attempt may take."""
+"""For which a process keeps a sink to itself."""
+RENEW_SECONDS: Final = 5.0
 ATTEMPT_SECONDS: Final = 10.0
+"""For one answer of a sink."""
+SEND_SECONDS: Final = 12.0
+"""For all that an event needs; ``HOLD_SECONDS - RENEW_SECONDS`` leaves some to note what came of it."""
 LOOK_SECONDS: Final = 2.0
 """How soon what others have changed is seen: a dead letter that is to be sent again, a sink that is free."""
 SETTLE_SECONDS: Final = 0.05
@@ -141,11 +145,12 @@ class Courier:
             await self._keeper.change(partial(self._deliveries.release, self._sink.name))
 
     async def _hold(self) -> bool:
-        if time.monotonic() > self._held_until - HOLD_SECONDS / 2:
+        """Whether there is time for an attempt in which no other process makes one."""
+        if time.monotonic() > self._held_until - HOLD_SECONDS + RENEW_SECONDS:
             asked = time.monotonic()
             held = await self._keeper.change(partial(self._deliveries.hold, self._sink.name, HOLD_SECONDS))
             self._held_until = asked + HOLD_SECONDS if held else 0.0
-        return self._held_until > 0
+        return time.monotonic() + SEND_SECONDS < self._held_until
 
     async def _deliver(self, session: Session) -> None:
         """While the session lasts and this process is the one that delivers."""
@@ -155,7 +160,7 @@ class Courier:
             await self._observe()
             due_s = LOOK_SECONDS
             for delivery in waiting:
-                due_s = (delivery.next_attempt_ns - time.time_ns()) / 1e9
+                due_s = _due_s(delivery)
                 if due_s > 0 or session.broken.is_set() or not await self._hold():
                     break
                 if not await self._attempt(session, delivery):
@@ -169,7 +174,7 @@ class Courier:
         """Tell the sink once, and note what came of it; whether the next event's turn has come."""
         attempts, state, error, wait_s = delivery.attempts + 1, _DELIVERED, None, 0.0
         try:
-            await session.send(delivery.event)
+            await _sent(session, delivery.event)
         except DeliveryRefusedError as err:
             state, error, wait_s = "pending", str(err), self._wait_s(attempts)
             if attempts >= self._attempts:
@@ -204,6 +209,21 @@ class Courier:
 
 
 _DELIVERED: DeliveryState = "delivered"
+
+
+async def _sent(session: Session, event: EventRecord) -> None:
+    """As ``Session.send``, but never for longer than the sink is held."""
+    try:
+        async with asyncio.timeout(SEND_SECONDS):
+            await session.send(event)
+    except TimeoutError:
+        raise DeliveryRefusedError(f"not taken within {SEND_SECONDS:g} s") from None
+
+
+def _due_s(delivery: Delivery) -> float:
+    """Seconds until the next attempt; what waits longer than anything may was noted by a clock that was ahead."""
+    due_s = (delivery.next_attempt_ns - time.time_ns()) / 1e9
+    return due_s if due_s <= LONGEST_WAIT_SECONDS else 0.0
 
 
 async def _first(*events: asyncio.Event, timeout_s: float) -> None:

@@ -71,14 +71,17 @@ class DeliveryStore:
         """Become, or stay, the one process that delivers to a sink; False: another one is.
 
         Args:
-            seconds: after which another one may, unless this is called again.
+            seconds: after which another one may, unless this is called again; the same in all processes. What is held
+                for longer than twice that was held by a clock that was ahead.
         """
         now_ns = time.time_ns()
         values = {"holder": self._holder, "held_until_ns": now_ns + round(seconds * 1e9)}
         with self._store.transaction(writes=True) as connection:
             insert: Any = postgresql.insert if connection.dialect.name == "postgresql" else sqlite.insert
             taken = insert(SINKS).values(sink=sink, **values)
-            free = sa.or_(SINKS.c.holder == self._holder, SINKS.c.held_until_ns < now_ns)
+            until = SINKS.c.held_until_ns
+            held = until.between(now_ns, now_ns + round(2 * seconds * 1e9))
+            free = sa.or_(SINKS.c.holder == self._holder, sa.not_(held))
             taken = taken.on_conflict_do_update(index_elements=["sink"], set_=values, where=free)
             return connection.execute(taken.returning(SINKS.c.sink)).scalar() is not None
 
@@ -102,12 +105,9 @@ class DeliveryStore:
         wanted = [DELIVERIES.c.state == state] if state is not None else []
         seq = DELIVERIES.c.event_seq
         events = sa.select(seq).where(*wanted, seq > after).distinct().order_by(seq).limit(limit + 1)
-        with self._store.transaction() as connection:
-            seqs = connection.execute(events).scalars().all()
-        if not seqs:
-            return [], False
-        last = seqs[:limit][-1]
-        return self._select([*wanted, seq <= last], None, after=after), len(seqs) > limit
+        found = self._select([*wanted, seq.in_(events)], None, after=after)  # one statement: nothing changes within it
+        seqs = sorted({one.seq for one in found})
+        return [one for one in found if one.seq in seqs[:limit]], len(seqs) > limit
 
     def get(self, event_id: str, sink: str) -> Delivery | None:
         found = self._select([EVENTS.c.event_id == event_id, DELIVERIES.c.sink == sink], 1, after=0)
@@ -116,12 +116,13 @@ class DeliveryStore:
     def note(
         self, delivery: Delivery, state: DeliveryState, *, attempts: int, next_attempt_ns: int, error: str | None
     ) -> None:
-        """What an attempt came to."""
+        """What an attempt came to, unless another process has made one meanwhile."""
         one = (DELIVERIES.c.event_seq == delivery.seq, DELIVERIES.c.sink == delivery.sink)
+        same = (DELIVERIES.c.state == "pending", DELIVERIES.c.attempts == delivery.attempts)
         with self._store.transaction(writes=True) as connection:
             connection.execute(
                 sa.update(DELIVERIES)
-                .where(*one)
+                .where(*one, *same)
                 .values(
                     state=state,
                     attempts=attempts,
@@ -169,7 +170,8 @@ class DeliveryStore:
                 if thing in seen:
                     continue
                 seen.add(thing)  # the first message that the sink has not got says where it stands
-                (found.setdefault(stream, set()).discard if kind == "start" else found[stream].add)(thing)
+                things = found.setdefault(stream, set())
+                (things.discard if kind == "start" else things.add)(thing)
         return found
 
     def _select(self, conditions: Sequence[Any], limit: int | None, *, after: int) -> list[Delivery]:

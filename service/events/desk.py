@@ -7,6 +7,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from viflow_anomaly.detection import Detection
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 RETRY_SECONDS: Final = 1.0
-FAREWELL_SECONDS: Final = 3.0
-"""For the ends of what is open when the service stops; what does not come through is ended by the next one."""
 
 
 @dataclass
@@ -36,6 +35,7 @@ class Noticed:
     Attributes:
         told: the events, each with the place of its detection among those of the call.
         records: the same, once it is known under which ids the detections are kept.
+        written: those of them that the commit of the detections wrote; None: nothing was written with them.
     """
 
     stream: LiveStream
@@ -45,11 +45,16 @@ class Noticed:
     log: EventLog
     new_id: IdMaker
     records: list[EventRecord] = field(default_factory=list)
+    written: Sequence[EventRecord] | None = None
 
     def kept_along(self, detection_ids: list[str]) -> Callable[[Connection], object] | None:
         """What ``ResultKeeper.keep`` is to keep with the detections."""
         self.name(detection_ids)
-        return self.log.part_of_commit(self.records)
+        write = self.log.part_of_commit(self.records)
+        return None if write is None else partial(self._write, write)
+
+    def _write(self, write: Callable[[Connection], Sequence[EventRecord]], connection: Connection) -> None:
+        self.written = write(connection)
 
     def name(self, detection_ids: Sequence[str] | None) -> None:
         """Make the records; None: the detections are kept nowhere."""
@@ -102,8 +107,7 @@ class EventDesk:
             noticed.name(None)
         stream.events = noticed.state
         self._metrics.held_back.inc(noticed.held_back)
-        self._metrics.count(noticed.records)
-        self._log.took(noticed.records)
+        self._metrics.count(self._log.took(noticed.records if noticed.written is None else noticed.written))
         if stream.gone:  # it was forgotten while the call was at work
             self.end(stream, "stream_deleted")
 
@@ -133,19 +137,24 @@ class EventDesk:
                     logger.exception("event_ends_failed")
                     self._ends.popleft()
 
-    async def close(self, streams: Sequence[LiveStream]) -> None:
-        """The service stops: once no call is at work, and ``watch`` has ended."""
+    async def close(self, streams: Sequence[LiveStream], *, until: float) -> None:
+        """The service stops: once no call is at work, and ``watch`` has ended.
+
+        Args:
+            until: in the event loop's time; what is not kept then is ended by the next process.
+        """
         for stream in streams:
             self.end(stream, "service_stopped")
         try:
-            async with asyncio.timeout(FAREWELL_SECONDS):
+            async with asyncio.timeout_at(until):
                 while self._ends:
                     await self._keep_end()
         except (Problem, TimeoutError):
             logger.warning("event_ends_left", extra={"streams": len(self._ends)})
+        except Exception:  # a fault of ours, which must not keep the rest from being closed
+            logger.exception("event_ends_left")
 
     async def _keep_end(self) -> None:
         ending, reason = self._ends[0]
-        await self._log.end(ending.stream.session_id, reason, ending.records)
-        self._metrics.count(ending.records)
+        self._metrics.count(await self._log.end(ending.stream.session_id, reason, ending.records))
         self._ends.popleft()

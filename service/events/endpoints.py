@@ -54,7 +54,8 @@ class LiveResponse(StreamingResponse):
     def __init__(self, readers: LiveReaders, place: Place, stream_id: str | None) -> None:
         self._readers = readers
         self._parts = readers.read(place, stream_id)
-        super().__init__(self._parts, media_type=SSE_MEDIA_TYPE)
+        headers = {"X-Accel-Buffering": "no"}  # nginx would hold events back until it has many
+        super().__init__(self._parts, headers=headers, media_type=SSE_MEDIA_TYPE)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:

@@ -58,7 +58,8 @@ class OpenEvent:
 
     Attributes:
         told_ns: source frame of its last message.
-        seen_ns: source frame in which it last had the score that keeps it open.
+        seen_ns: source frame in which it last had the score that keeps it open; later by the time of pairs since then
+            that could not be judged.
     """
 
     track_id: int
@@ -111,16 +112,16 @@ class EventStep(NamedTuple):
 def step(rules: EventRules, state: EventState, detection: Detection) -> EventStep:
     """One detection, later than those before."""
     now_ns = detection.source_timestamp_ns
+    if detection.status == "abstained":
+        return EventStep(_unjudged(state, now_ns, detection.image), (), 0)
     moving = {roi.track_id: roi for roi in reversed(detection.rois) if roi.label == MOTION and roi.track_id is not None}
     open_events, told = _gone_on(rules, state, moving, now_ns)
     events = [TrackEvent(kind, event, now_ns, detection.image, _left(kind)) for kind, event in told]
     quiet_until_ns = state.quiet_until_ns
     if any(one.kind == "end" for one in events):
         quiet_until_ns = now_ns + _ns(rules.cooldown_s)
-    candidates = state.candidates
     new = {key: roi for key, roi in moving.items() if key not in open_events}
-    if detection.status == "ok":  # a pair that could not be judged speaks neither for nor against a track
-        candidates = _counted(rules, candidates, new, now_ns)
+    candidates: Mapping[int, Candidate] = _counted(rules, state.candidates, new, now_ns)
     ready = {key for key, one in candidates.items() if one.pairs >= rules.start_pairs and key in new}
     held_back = 0
     if quiet_until_ns is not None and now_ns < quiet_until_ns:
@@ -144,6 +145,13 @@ def end_all(state: EventState, reason: EndReason) -> tuple[TrackEvent, ...]:
         return ()
     now_ns, image = state.newest
     return tuple(TrackEvent("end", event, now_ns, image, reason) for event in state.open.values())
+
+
+def _unjudged(state: EventState, now_ns: int, image: ImageSize) -> EventState:
+    """After a pair that speaks neither for nor against a track: its time is not one in which nothing was seen."""
+    passed_ns = 0 if state.newest is None else now_ns - state.newest[0]
+    still = {key: replace(event, seen_ns=event.seen_ns + passed_ns) for key, event in state.open.items()}
+    return replace(state, open=still, newest=(now_ns, image))
 
 
 def _gone_on(

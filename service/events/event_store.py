@@ -12,7 +12,7 @@ from sqlalchemy.engine import Connection
 
 from viflow_anomaly_service.events.event_record import EventRecord, ended
 from viflow_anomaly_service.events.event_rules import EndReason
-from viflow_anomaly_service.events.log import LoggedEvent
+from viflow_anomaly_service.events.log import LoggedEvent, Place
 from viflow_anomaly_service.events.query import EventFilter
 from viflow_anomaly_service.store.detection_store import DetectionStore
 from viflow_anomaly_service.store.record import IdMaker
@@ -38,6 +38,7 @@ class EventStore:
         store: whose database it is.
         sinks: names of those who are to be told of every event.
         holder: this process; what it has begun is its own for ``hold_s`` after ``hold_open``.
+        hold_s: the same in all processes. What is held for longer than twice that was held by a clock that was ahead.
     """
 
     def __init__(self, store: DetectionStore, *, sinks: Sequence[str], holder: str, hold_s: float) -> None:
@@ -47,35 +48,34 @@ class EventStore:
         self._hold_ns = round(hold_s * 1e9)
         self._new_id = IdMaker()
 
-    def insert(self, connection: Connection, events: Iterable[EventRecord]) -> None:
-        """Events in their order, each with a delivery to every sink.
+    def insert(self, connection: Connection, events: Iterable[EventRecord]) -> list[EventRecord]:
+        """Those that were written: events in their order, each with a delivery to every sink.
 
         One that is there already is left out (a call that was sent again because nobody knew of its commit), and so is
         what would come behind the end of its event (another process has taken this one for dead).
         """
         if connection.dialect.name == "postgresql":  # numbers are given in the order of commits
             connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_ORDER_LOCK)))
-        for event in events:
-            self._insert(connection, event)
+        return [event for event in events if self._insert(connection, event)]
 
-    def add(self, events: Sequence[EventRecord]) -> None:
+    def add(self, events: Sequence[EventRecord]) -> list[EventRecord]:
         """As ``insert``, in a transaction of its own."""
         with self._store.transaction(writes=True) as connection:
-            self.insert(connection, events)
+            return self.insert(connection, events)
 
     def newest(self) -> int:
         """The number of the last event; 0: there was none."""
         with self._store.transaction() as connection:
             return connection.execute(sa.select(sa.func.max(EVENTS.c.seq))).scalar_one() or 0
 
-    def seq_of(self, event_id: str) -> int:
-        """The number of an event, or of the last one before its time where it is gone."""
+    def place_of(self, event_id: str) -> Place:
+        """Behind an event, or behind the last one before its time where it is gone."""
         with self._store.transaction() as connection:
             found = connection.execute(sa.select(EVENTS.c.seq).where(EVENTS.c.event_id == event_id)).scalar()
-            if found is None:
-                earlier = sa.select(sa.func.max(EVENTS.c.seq)).where(EVENTS.c.event_id < event_id)
-                found = connection.execute(earlier).scalar()
-        return found or 0
+            if found is not None:
+                return Place(found, gap=False)
+            earlier = sa.select(sa.func.max(EVENTS.c.seq)).where(EVENTS.c.event_id < event_id)
+            return Place(connection.execute(earlier).scalar() or 0, gap=True)
 
     def after(self, seq: int, limit: int) -> list[LoggedEvent]:
         """The events behind a number, in order."""
@@ -107,12 +107,17 @@ class EventStore:
         """Whether something is open of a session of a stream."""
         return self._some_open(_of_session(session_id))
 
-    def end_session(self, session_id: str, reason: EndReason, ends: Sequence[EventRecord]) -> None:
-        """Keep these ends, and end what else is open: its start was committed, though nobody came to know of it."""
+    def end_session(self, session_id: str, reason: EndReason, ends: Sequence[EventRecord]) -> list[EventRecord]:
+        """Keep these ends, and end what else is open: its start was committed, though nobody came to know of it.
+
+        Returns:
+            what was written.
+        """
         with self._store.transaction(writes=True) as connection:
-            self.insert(connection, ends)
+            written = self.insert(connection, ends)
             left = connection.execute(sa.select(OPEN_EVENTS.c.body).where(_of_session(session_id))).scalars().all()
-            self.insert(connection, [ended(body, event_id=self._new_id(), reason=reason) for body in left])
+            others = [ended(body, event_id=self._new_id(), reason=reason) for body in left]
+            return written + self.insert(connection, others)
 
     def holds_some(self) -> bool:
         """Whether something is open that this process has begun."""
@@ -120,25 +125,28 @@ class EventStore:
 
     def has_abandoned(self) -> bool:
         """Whether something is open that a process has begun which is no more."""
-        return self._some_open(OPEN_EVENTS.c.held_until_ns < time.time_ns())
+        return self._some_open(self._abandoned())
 
     def end_abandoned(self) -> int:
         """End what processes have begun that are no more; how many events that were."""
-        gone = sa.select(OPEN_EVENTS.c.body).where(OPEN_EVENTS.c.held_until_ns < time.time_ns())
+        gone = sa.select(OPEN_EVENTS.c.body).where(self._abandoned())
         with self._store.transaction(writes=True) as connection:
             bodies = connection.execute(gone.limit(ENDED_AT_ONCE)).scalars().all()
             ends = [ended(body, event_id=self._new_id(), reason="service_restarted") for body in bodies]
-            self.insert(connection, ends)
-        return len(ends)
+            return len(self.insert(connection, ends))
+
+    def _abandoned(self) -> sa.ColumnElement[bool]:
+        now_ns = time.time_ns()
+        return sa.not_(OPEN_EVENTS.c.held_until_ns.between(now_ns, now_ns + 2 * self._hold_ns))
 
     def _some_open(self, condition: sa.ColumnElement[bool]) -> bool:
         with self._store.transaction() as connection:
             return connection.execute(sa.select(OPEN_EVENTS.c.thing_id).where(condition).limit(1)).first() is not None
 
-    def _insert(self, connection: Connection, event: EventRecord) -> None:
+    def _insert(self, connection: Connection, event: EventRecord) -> bool:
         mine = OPEN_EVENTS.c.thing_id == event.thing_id
         if event.kind != "start" and connection.execute(sa.select(OPEN_EVENTS.c.thing_id).where(mine)).first() is None:
-            return
+            return False
         made = _insertion(connection)(EVENTS).values(
             event_id=event.event_id,
             thing_id=event.thing_id,
@@ -150,7 +158,7 @@ class EventStore:
         made = made.on_conflict_do_nothing(index_elements=["thing_id", "kind", "timestamp_ns"])
         seq = connection.execute(made.returning(EVENTS.c.seq)).scalar()
         if seq is None:
-            return
+            return False
         if event.kind == "end":
             connection.execute(sa.delete(OPEN_EVENTS).where(mine))
         else:
@@ -164,6 +172,7 @@ class EventStore:
         waiting = {"event_seq": seq, "state": "pending", "attempts": 0, "next_attempt_ns": now_ns}
         if self._sinks:
             connection.execute(sa.insert(DELIVERIES), [{**waiting, "sink": sink} for sink in self._sinks])
+        return True
 
 
 def _of_session(session_id: str) -> sa.ColumnElement[bool]:

@@ -45,14 +45,14 @@ class EventLog(Protocol):
     async def after(self, seq: int, limit: int) -> list[LoggedEvent] | None:
         """Events behind a number; None: some of them are gone."""
 
-    def part_of_commit(self, events: Sequence[EventRecord]) -> Callable[[Connection], object] | None:
-        """What keeps the events together with their detections; None: nothing can."""
+    def part_of_commit(self, events: Sequence[EventRecord]) -> Callable[[Connection], Sequence[EventRecord]] | None:
+        """What keeps the events together with their detections, and gives those that are new; None: nothing can."""
 
-    def took(self, events: Sequence[EventRecord]) -> None:
-        """The detections are kept, and with them what ``part_of_commit`` keeps."""
+    def took(self, events: Sequence[EventRecord]) -> Sequence[EventRecord]:
+        """The detections are kept, and with them what ``part_of_commit`` keeps; gives the events that are new."""
 
-    async def end(self, session_id: str, reason: EndReason, ends: Sequence[EventRecord]) -> None:
-        """Keep the ends of a session of a stream, and end what else is open in it.
+    async def end(self, session_id: str, reason: EndReason, ends: Sequence[EventRecord]) -> Sequence[EventRecord]:
+        """Keep the ends of a session of a stream, and end what else is open in it; gives the ends that are new.
 
         Raises:
             Problem: 503 ``store_...``.
@@ -106,14 +106,17 @@ class MemoryLog:
     def part_of_commit(self, events: Sequence[EventRecord]) -> None:
         return None
 
-    def took(self, events: Sequence[EventRecord]) -> None:
+    def took(self, events: Sequence[EventRecord]) -> Sequence[EventRecord]:
+        taken = []
         for event in events:
             if event.kind != "start" and event.thing_id not in self._open:
                 continue  # it has ended: its stream was forgotten while a call was at work
             (self._open.discard if event.kind == "end" else self._open.add)(event.thing_id)
             self._kept.append(LoggedEvent(next(self._numbers), event))
-        if events:
+            taken.append(event)
+        if taken:
             self._bell.ring()
+        return taken
 
-    async def end(self, session_id: str, reason: EndReason, ends: Sequence[EventRecord]) -> None:
-        self.took(ends)
+    async def end(self, session_id: str, reason: EndReason, ends: Sequence[EventRecord]) -> Sequence[EventRecord]:
+        return self.took(ends)

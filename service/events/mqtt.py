@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 MQTT_NAME: Final = "mqtt"
 ONLINE: Final = "online"
 OFFLINE: Final = "offline"
-FAREWELL_SECONDS: Final = 2.0
+FAREWELL_SECONDS: Final = 1.0
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9-]", re.ASCII)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Final
 
 from sqlalchemy.engine import Connection
 
@@ -14,9 +13,6 @@ from viflow_anomaly_service.events.event_rules import EndReason
 from viflow_anomaly_service.events.event_store import EventStore
 from viflow_anomaly_service.events.log import Bell, LoggedEvent, Place
 from viflow_anomaly_service.store.keeper import ResultKeeper
-
-POLL_SECONDS: Final = 1.0
-"""How soon events of other processes are seen."""
 
 
 class StoreLog:
@@ -41,23 +37,26 @@ class StoreLog:
         return await self._keeper.read(self._events.newest)
 
     async def place_of(self, event_id: str) -> Place:
-        return Place(await self._keeper.read(partial(self._events.seq_of, event_id)), gap=False)
+        return await self._keeper.read(partial(self._events.place_of, event_id))
 
     async def after(self, seq: int, limit: int) -> list[LoggedEvent]:
         return await self._keeper.read(partial(self._events.after, seq, limit))
 
-    def part_of_commit(self, events: Sequence[EventRecord]) -> Callable[[Connection], object] | None:
+    def part_of_commit(self, events: Sequence[EventRecord]) -> Callable[[Connection], Sequence[EventRecord]] | None:
         return partial(self._events.insert, events=events) if events else None
 
-    def took(self, events: Sequence[EventRecord]) -> None:
+    def took(self, events: Sequence[EventRecord]) -> Sequence[EventRecord]:
         if events:
             self._bell.ring()
+        return events
 
-    async def end(self, session_id: str, reason: EndReason, ends: Sequence[EventRecord]) -> None:
+    async def end(self, session_id: str, reason: EndReason, ends: Sequence[EventRecord]) -> Sequence[EventRecord]:
         is_open: bool = await self._keeper.read(partial(self._events.is_open, session_id))
         if ends or is_open:
-            await self._keeper.change(partial(self._events.end_session, session_id, reason, ends))
+            written = await self._keeper.change(partial(self._events.end_session, session_id, reason, ends))
             self._bell.ring()
+            return written
+        return []
 
     async def look(self) -> None:
         """Wake those who wait, if another process has kept events."""

@@ -206,7 +206,10 @@ class StreamTable:
         """Forget what was idle for too long."""
         while True:
             await asyncio.sleep(min(LOOK_SECONDS, self._settings.stream_idle_s / 2))
-            self._forget_idle()
+            try:
+                self._forget_idle()
+            except Exception:  # a fault of ours, which must not end the watch
+                logger.exception("streams_not_watched")
 
     def _forget_idle(self) -> None:
         """Apart from the loop, which would keep the last stream that it looked at while it sleeps: images, model."""

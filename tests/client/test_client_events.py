@@ -169,6 +169,12 @@ def test_any_cut_gives_the_same_events(step: int) -> None:
     assert (lines.last_id, lines.retry_s) == ("1", 1.5)
 
 
+def test_a_gap_has_the_id_of_the_event_before() -> None:
+    lines = EventLines("e1")
+    found = list(lines.feed(b'event: gap\ndata: {"reason": "not_kept"}\n\n' + event_text(9)))
+    assert found == [LiveEvent("e1", "gap", {"reason": "not_kept"}), LiveEvent("e9", "alarm", {"number": 9})]
+
+
 def test_an_id_alone_moves_on_and_one_with_nul_does_not() -> None:
     lines = EventLines("0")
     assert list(lines.feed(b"id: 5\n\n")) == []

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import hashlib
 import hmac
 import json
+import sqlite3
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,6 +23,7 @@ from webhook_receiver import WebhookReceiver, endless_receiver, webhook_receiver
 
 from viflow_anomaly_service.events import courier, webhook
 from viflow_anomaly_service.events.mqtt import Topics
+from viflow_anomaly_service.events.mqtt_connection import MqttConnection
 
 SECRET = "correct horse"  # noqa: S105 - of a test
 
@@ -84,6 +87,26 @@ def test_a_webhook_that_fails_is_tried_again_and_order_is_kept(tmp_path: Path) -
     name = webhook.webhook_name(receiver.url)
     assert f'viflow_event_deliveries_total{{result="refused",sink="{name}"}} 4.0' in text
     assert f'viflow_event_deliveries_total{{result="delivered",sink="{name}"}} 3.0' in text
+
+
+@pytest.mark.usefixtures("impatient")
+def test_what_waits_for_a_clock_that_was_ahead_goes_on(tmp_path: Path) -> None:
+    refusing = [True]
+    with webhook_receiver(lambda event: 500 if refusing[0] else 200) as receiver:
+        with posting(receiver, tmp_path) as server:
+            play(server.client, "hall", ONE_EVENT)
+            wait_until(lambda: deliveries(server)[0]["attempts"] > 0)
+        refusing[0] = False
+        with contextlib.closing(sqlite3.connect(tmp_path / "events.db")) as connection, connection:
+            ahead_ns = time.time_ns() + 3600 * 10**9
+            connection.execute("UPDATE event_deliveries SET next_attempt_ns = ?", (ahead_ns,))
+            held = (webhook.webhook_name(receiver.url), "d" * 32, ahead_ns)
+            connection.execute(
+                "INSERT OR REPLACE INTO event_sinks (sink, holder, held_until_ns) VALUES (?, ?, ?)", held
+            )
+        with posting(receiver, tmp_path):
+            wait_until(lambda: len(receiver.taken()) == 3, seconds=30)
+    assert kinds(receiver) == KINDS
 
 
 @pytest.mark.usefixtures("impatient")
@@ -156,6 +179,35 @@ def test_a_receiver_that_does_not_answer_is_given_up_in_time(tmp_path: Path, mon
         wait_until(lambda: len(deliveries(server, state="delivered")) == 3, seconds=30)
         assert deliveries(server)[0]["attempts"] > 1
     assert kinds(receiver) == KINDS
+
+
+def test_an_attempt_is_shorter_than_the_lease() -> None:
+    assert courier.ATTEMPT_SECONDS < courier.SEND_SECONDS < courier.HOLD_SECONDS - courier.RENEW_SECONDS
+
+
+@pytest.mark.usefixtures("impatient")
+def test_an_event_that_takes_many_answers_is_given_up_in_time(
+    broker: MosquittoServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first attempt hangs between two messages, though each of them would be in time."""
+    published, publish = [], MqttConnection.publish
+
+    async def publish_slowly(connection: MqttConnection, topic: str, payload: str, *, retain: bool) -> None:
+        published.append(topic)
+        if published.count("viflow/hall/events") == 1:
+            await asyncio.sleep(0.2)
+        await publish(connection, topic, payload, retain=retain)
+
+    monkeypatch.setattr(courier, "SEND_SECONDS", 0.3)
+    monkeypatch.setattr(MqttConnection, "publish", publish_slowly)
+    address = {"store_url": str(tmp_path / "events.db"), "mqtt_url": broker.url}
+    with live_server(lambda settings: ScriptedDetector(), **QUICK, **address, event_delivery_attempts=100) as server:
+        play(server.client, "hall", ONE_EVENT)
+        wait_until(lambda: len(deliveries(server, state="delivered")) == 3, seconds=30)
+        found = deliveries(server)[0]
+    assert found["attempts"] > 1
+    assert found["last_error"] is None
+    assert published.count("viflow/hall/events") > 3
 
 
 @pytest.mark.usefixtures("impatient")

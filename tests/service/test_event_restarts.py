@@ -19,6 +19,7 @@ from scripted_detector import ScriptedDetector as RuleDetector
 from viflow_anomaly_service.events import abandoned, courier
 abandoned.HOLD_SECONDS, abandoned.BEAT_SECONDS = 3.0, 0.5
 courier.HOLD_SECONDS, courier.LOOK_SECONDS = 3.0, 0.1
+courier.SEND_SECONDS, courier.RENEW_SECONDS = 2.0, 0.5
 """
 """A process is taken for dead soon, so that the test does not take for ever."""
 

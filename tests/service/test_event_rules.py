@@ -87,6 +87,16 @@ def test_a_short_gap_ends_nothing() -> None:
     assert found == [(0.4, "start", 1), (1.6, "update", 1)]
 
 
+def test_pairs_that_could_not_be_judged_end_nothing() -> None:
+    begun = every(0.1, {1: 0.6}, {1: 0.6})
+    blurred = [detection(k / 10, {}, judged=False) for k in range(2, 50)]
+    found, _, _ = told(RULES, *begun, *blurred, detection(5.0, {1: 0.6}))
+    assert found == [(0.1, "start", 1), (5.0, "update", 1)]
+    unseen = [detection(5.0 + k / 10, {}) for k in range(12)]
+    found, _, _ = told(RULES, *begun, *blurred, *unseen)
+    assert found == [(0.1, "start", 1), (5.9, "end", 1)]  # a second without it, of pairs that were judged
+
+
 def test_a_track_that_is_there_again_after_a_pause_of_the_camera_goes_on() -> None:
     found, _, _ = told(RULES, detection(0, {1: 0.6}), detection(0.1, {1: 0.6}), detection(60, {1: 0.6}))
     assert found == [(0.1, "start", 1), (60.0, "update", 1)]

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
@@ -15,6 +17,7 @@ import sqlalchemy as sa
 from alembic import command
 from alembic.config import Config
 
+from viflow_anomaly_service.events import delivery_store, event_store
 from viflow_anomaly_service.events.delivery_store import DeliveryStore
 from viflow_anomaly_service.events.event_record import EventRecord
 from viflow_anomaly_service.events.event_store import EventStore
@@ -25,7 +28,7 @@ from viflow_anomaly_service.events.query import EventFilter
 from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.store.detection_store import DetectionStore
 from viflow_anomaly_service.store.engine import MIGRATIONS, make_engine, store_url
-from viflow_anomaly_service.store.record import IdMaker
+from viflow_anomaly_service.store.record import IdMaker, first_id_at, stored_at_ns
 
 NEW_ID = IdMaker()
 SINKS = ("mqtt", "webhook-000000000000")
@@ -49,10 +52,33 @@ def deliveries(store: DetectionStore) -> DeliveryStore:
     return DeliveryStore(store, holder="a" * 32)
 
 
+@dataclass
+class Clock:
+    """The wall clock as events and deliveries see it."""
+
+    ahead_s: float = 0.0
+
+    def time_ns(self) -> int:
+        return time.time_ns() + round(self.ahead_s * 1e9)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr(delivery_store, "time", made)
+    monkeypatch.setattr(event_store, "time", made)
+    return made
+
+
 def event(kind: Any, thing: str = "t-1", *, at: int = 0, stream: str = "hall") -> EventRecord:
     new_id = NEW_ID()
     body = {"event_id": new_id, "kind": kind, "thing_id": thing, "stream_id": stream, "timestamp_ns": at}
     return EventRecord(new_id, thing, kind, stream, at, json.dumps(body))
+
+
+def id_of_an_hour_ago(told: EventRecord) -> str:
+    earlier = first_id_at(stored_at_ns(told.event_id) - 3600 * 10**9)
+    return earlier + told.event_id[len(earlier) :]
 
 
 def kinds(events: EventStore) -> list[str]:
@@ -62,8 +88,8 @@ def kinds(events: EventStore) -> list[str]:
 def test_what_is_there_already_or_behind_its_end_is_left_out(events: EventStore) -> None:
     first = [event("start", at=1), event("update", at=2), event("end", at=3)]
     events.add(first)
-    events.add([event("start", at=1), event("update", at=2), event("end", at=3)])  # sent again
-    events.add([event("update", at=4), event("end", at=5)])  # of one that has ended
+    assert events.add([event("start", at=1), event("update", at=2), event("end", at=3)]) == []  # sent again
+    assert events.add([event("update", at=4), event("end", at=5)]) == []  # of one that has ended
     assert [one.event for one in events.after(0, 10)] == first
     events.add([event("start", at=6)])
     events.add([event("end", at=7)])
@@ -106,12 +132,13 @@ def test_the_place_of_an_event_that_is_gone_is_behind_those_before_it(
 ) -> None:
     told = [event("start", f"t-{k}") for k in range(3)]
     events.add(told)
-    assert events.seq_of(told[1].event_id) == events.after(0, 2)[1].seq
+    assert events.place_of(told[1].event_id) == Place(events.after(0, 2)[1].seq, gap=False)
     gone = NEW_ID()
     later = event("start", "t-9")
     events.add([later])
-    assert [one.event for one in events.after(events.seq_of(gone), 9)] == [later]
-    assert events.seq_of("0" * 32) == 0
+    place = events.place_of(gone)
+    assert ([one.event for one in events.after(place.seq, 9)], place.gap) == ([later], True)
+    assert events.place_of("0" * 32) == Place(0, gap=True)
 
 
 def test_numbers_are_not_given_again(events: EventStore, store: DetectionStore) -> None:
@@ -126,13 +153,12 @@ def test_numbers_are_not_given_again(events: EventStore, store: DetectionStore) 
 def test_events_and_their_deliveries_go_with_the_detections_of_their_time(
     events: EventStore, store: DetectionStore, deliveries: DeliveryStore
 ) -> None:
-    old = [event("start"), event("end")]
-    events.add(old)
-    time.sleep(0.05)
+    old = [replace(one, event_id=id_of_an_hour_ago(one)) for one in (event("start"), event("end"))]
     new = event("start", "t-2")
-    events.add([new])
-    store.prune(max_age_s=0.04, max_bytes=None)
-    assert [one.event for one in events.after(0, 9)] in ([new], [])
+    events.add([*old, new])
+    store.prune(max_age_s=1800.0, max_bytes=None)
+    assert [one.event for one in events.after(0, 9)] == [new]
+    assert [one.event for one in deliveries.pending("mqtt", 9)] == [new]
     store.prune(max_age_s=1e-6, max_bytes=None)
     assert deliveries.pending("mqtt", 9) == []
 
@@ -154,16 +180,28 @@ def test_what_a_dead_process_has_begun_is_ended_once(store: DetectionStore) -> N
     assert kinds(alive).count("end") == 2
 
 
-def test_who_lives_keeps_what_it_has_begun(store: DetectionStore) -> None:
-    events = EventStore(store, sinks=(), holder="a" * 32, hold_s=0.2)
+def test_who_lives_keeps_what_it_has_begun(store: DetectionStore, clock: Clock) -> None:
+    events = EventStore(store, sinks=(), holder="a" * 32, hold_s=30.0)
     events.add([event("start")])
-    keeping = EventStore(store, sinks=(), holder="a" * 32, hold_s=60.0)
-    keeping.hold_open()
-    time.sleep(0.25)
+    clock.ahead_s = 20.0
+    events.hold_open()
+    clock.ahead_s = 45.0
     assert not events.has_abandoned()
+    clock.ahead_s = 55.0
+    assert events.has_abandoned()
 
 
-def test_one_process_delivers_to_a_sink(store: DetectionStore) -> None:
+def test_what_a_clock_that_was_ahead_held_is_abandoned(store: DetectionStore, clock: Clock) -> None:
+    dead, alive = (EventStore(store, sinks=(), holder=name * 32, hold_s=30.0) for name in "da")
+    clock.ahead_s = 3600.0
+    dead.add([event("start", "d-1")])
+    assert not alive.has_abandoned()
+    clock.ahead_s = 0.0
+    assert alive.has_abandoned()
+    assert alive.end_abandoned() == 1
+
+
+def test_one_process_delivers_to_a_sink(store: DetectionStore, clock: Clock) -> None:
     one, other = (DeliveryStore(store, holder=name * 32) for name in "ab")
     assert one.hold("mqtt", 30.0)
     assert one.hold("mqtt", 30.0)
@@ -172,9 +210,19 @@ def test_one_process_delivers_to_a_sink(store: DetectionStore) -> None:
     other.release("mqtt")  # not its own
     assert not other.hold("mqtt", 30.0)
     one.release("mqtt")
-    assert other.hold("mqtt", 0.0)
-    time.sleep(0.01)
+    assert other.hold("mqtt", 30.0)
+    clock.ahead_s = 31.0
     assert one.hold("mqtt", 30.0)
+
+
+def test_a_sink_that_a_clock_that_was_ahead_held_is_free(store: DetectionStore, clock: Clock) -> None:
+    dead, alive = (DeliveryStore(store, holder=name * 32) for name in "da")
+    clock.ahead_s = 3600.0
+    assert dead.hold("mqtt", 30.0)
+    clock.ahead_s = 3595.0  # as clocks of replicas differ
+    assert not alive.hold("mqtt", 30.0)
+    clock.ahead_s = 0.0
+    assert alive.hold("mqtt", 30.0)
 
 
 def test_deliveries_wait_in_order_until_they_are_noted(events: EventStore, deliveries: DeliveryStore) -> None:
@@ -197,6 +245,47 @@ def test_deliveries_wait_in_order_until_they_are_noted(events: EventStore, deliv
     assert deliveries.get("0" * 32, "mqtt") is None
 
 
+def test_a_page_is_whole_though_a_delivery_is_noted_meanwhile(
+    events: EventStore,
+    deliveries: DeliveryStore,
+    store: DetectionStore,
+    empty_store_url: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told = [event("start"), event("update", at=1)]
+    events.add(told)
+    first, _ = deliveries.pending("mqtt", 9)
+    other = DetectionStore(empty_store_url)
+    noting = DeliveryStore(other, holder="b" * 32)
+    begin = store.transaction
+
+    @contextlib.contextmanager
+    def noted_behind(*, writes: bool = False) -> Iterator[sa.Connection]:
+        with begin(writes=writes) as connection:
+            yield connection
+        for sink in SINKS:
+            noting.note(replace(first, sink=sink), "delivered", attempts=1, next_attempt_ns=0, error=None)
+
+    monkeypatch.setattr(store, "transaction", noted_behind)
+    found, more = deliveries.page("pending", 1, 0)
+    assert ([(one.event, one.sink) for one in found], more) == ([(told[0], sink) for sink in SINKS], True)
+    other.close()
+
+
+def test_an_attempt_that_is_noted_late_changes_nothing(events: EventStore, deliveries: DeliveryStore) -> None:
+    events.add([event("start"), event("end", at=1)])
+    first, second = deliveries.pending("mqtt", 9)
+    deliveries.note(first, "delivered", attempts=1, next_attempt_ns=0, error=None)
+    deliveries.note(first, "dead", attempts=1, next_attempt_ns=0, error="late")
+    deliveries.note(second, "pending", attempts=1, next_attempt_ns=5, error="first")
+    deliveries.note(second, "pending", attempts=1, next_attempt_ns=9, error="late")
+    found, _ = deliveries.page(None, 9, 0)
+    assert [(one.state, one.last_error) for one in found if one.sink == "mqtt"] == [
+        ("delivered", None),
+        ("pending", "first"),
+    ]
+
+
 def test_what_is_open_is_as_the_sink_was_told(events: EventStore, deliveries: DeliveryStore) -> None:
     def tell(count: int) -> None:
         for one in deliveries.pending("mqtt", count):
@@ -210,6 +299,17 @@ def test_what_is_open_is_as_the_sink_was_told(events: EventStore, deliveries: De
     assert deliveries.open_things("mqtt") == {"hall": set(), "door": {"d-1"}}
     events.add([event("end", "d-1", at=1, stream="door"), event("start", "d-1", at=2, stream="door")])
     assert deliveries.open_things("mqtt") == {"hall": set(), "door": {"d-1"}}
+
+
+def test_what_is_open_is_known_beyond_the_newest_streams(
+    events: EventStore, deliveries: DeliveryStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(delivery_store, "KNOWN_STREAMS", 1)
+    events.add([event("start", "h-1")])
+    for one in deliveries.pending("mqtt", 1):
+        deliveries.note(one, "delivered", attempts=1, next_attempt_ns=0, error=None)
+    events.add([event("end", "h-1", at=1), event("start", "d-1", stream="door"), event("start", "y-1", stream="yard")])
+    assert deliveries.open_things("mqtt") == {"hall": {"h-1"}, "door": set(), "yard": set()}
 
 
 def test_a_store_of_the_first_version_is_brought_up_to_date(empty_store_url: str) -> None:
@@ -256,7 +356,8 @@ def test_a_reader_that_falls_behind_the_ring_is_told_of_the_gap() -> None:
 def test_the_ring_ends_what_has_begun_once() -> None:
     async def tell() -> list[str]:
         log = MemoryLog(9)
-        log.took([event("start"), event("end", at=1), event("end", at=2), event("update", at=3)])
+        told = [event("start"), event("end", at=1), event("end", at=2), event("update", at=3)]
+        assert log.took(told) == told[:2]
         found = await log.after(0, 9)
         assert found is not None
         return [one.event.kind for one in found]

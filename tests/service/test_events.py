@@ -76,6 +76,38 @@ def test_a_reader_is_told_of_start_update_and_end(telling: LiveServer) -> None:
         assert [event["detection_id"] for event in events] == [None] * 3
 
 
+def test_a_reader_whose_last_event_is_deleted_is_told(storing: LiveServer) -> None:
+    play(storing.client, "hall", ONE_EVENT)
+    first, *rest = listed(storing, order="asc")["events"]
+    with reading(url(storing), last_event_id=first["event_id"]) as stream:
+        wait_until(lambda: len(stream.messages) == 2)
+    assert stream.ids == [event["event_id"] for event in rest]
+    with reading(url(storing), last_event_id="0" * 31 + "1") as stream:
+        wait_until(lambda: len(stream.messages) == 4)
+    assert [kind for _, kind, _ in stream.messages] == ["gap", *KINDS]
+
+
+def test_events_are_counted_once_though_they_come_twice(storing: LiveServer) -> None:
+    play(storing.client, "hall", ONE_EVENT[:4])
+    core = storing.app.state.core
+    (thing_id,) = {event["thing_id"] for event in listed(storing)["events"]}
+    last = listed(storing)["events"][0]
+    end = EventRecord(
+        IdMaker()(), thing_id, "end", "hall", last["timestamp_ns"] + 1, json.dumps(last | {"kind": "end"})
+    )
+    core.events.stored.events.add([end])  # by another process, which has taken this one for dead
+    assert storing.client.delete("/streams/hall").status_code == 204
+    wait_until(lambda: not core.events.desk._ends)
+    play(storing.client, "door", ONE_EVENT)
+    assert 'viflow_events_total{kind="end"} 1.0' in storing.client.get("/metrics").text
+    assert len(listed(storing, kind="end")["events"]) == 2
+
+
+def test_no_proxy_holds_events_back(telling: LiveServer) -> None:
+    with telling.client.stream("GET", "/events/live") as answer:
+        assert answer.headers["X-Accel-Buffering"] == "no"
+
+
 def test_events_are_what_the_document_says(storing: LiveServer) -> None:
     play(storing.client, "hall", ONE_EVENT)
     document = storing.client.get("/openapi.json").json()

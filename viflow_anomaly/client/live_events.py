@@ -24,9 +24,11 @@ class LiveEvent:
     """One event.
 
     Attributes:
-        event_id: under which it is stored; what follows it is had with ``after=event_id``.
-        kind: what happened.
-        data: the event itself.
+        event_id: under which it is stored; what follows it is had with ``after=event_id``. Of a ``gap``: of the event
+            before it, "" where there was none.
+        kind: what happened: ``start``, ``update``, ``end``; or ``gap``, which is none itself: ahead of the next one
+            some may be missing, because the service has deleted them.
+        data: the event itself; of a ``gap`` its ``reason``.
     """
 
     event_id: str
