@@ -1,7 +1,8 @@
 """``/streams/{id}`` as a WebSocket: an opening message, then calls in and answers out, in order, one at a time.
 
 Each call takes the path of ``POST /streams/{id}/frames``. What a connection may have inside is small: one message at
-work, ``AHEAD`` behind it; then its socket is not read until there is room.
+work, ``AHEAD`` behind it; then its socket is not read until there is room. Before the opening message was accepted
+there is room for that one alone.
 """
 
 from __future__ import annotations
@@ -120,6 +121,7 @@ class StreamSocket:
         async with self._inbox.filled():
             try:
                 setup = await self._opened(places, place)
+                self._inbox.widen()
                 await self._send({"opened": {"stream_id": self._stream_id}})
                 number = 0
                 while True:
@@ -210,17 +212,26 @@ class StreamSocket:
 
 
 class Inbox:
-    """What has arrived and waits; knows when the peer has gone, also while a message is at work.
+    """What has arrived and waits: the opening message alone, then ``AHEAD``.
 
     Attributes:
-        left: the peer has gone.
+        left: the peer has gone. Heard of also while a message is at work and others wait, unless the peer has sent more
+            than the system holds for a socket that is not read: then a ping without answer tells.
     """
 
     def __init__(self, websocket: WebSocket, closing: asyncio.Event) -> None:
         self._websocket = websocket
         self._closing = closing
-        self._messages: asyncio.Queue[str | bytes] = asyncio.Queue(AHEAD)
-        self.left = asyncio.Event()
+        self._messages: asyncio.Queue[str | bytes] = asyncio.Queue()
+        self._room = asyncio.Semaphore(1)
+        self._wide = False
+        self.left: asyncio.Event = websocket.scope.get("viflow_left") or asyncio.Event()
+
+    def widen(self) -> None:
+        """The opening message was taken and accepted."""
+        self._wide = True
+        for _ in range(AHEAD):
+            self._room.release()
 
     @contextlib.asynccontextmanager
     async def filled(self) -> AsyncIterator[None]:
@@ -249,6 +260,8 @@ class Inbox:
         try:
             await asyncio.wait({message, left, closing}, timeout=patience_s, return_when=asyncio.FIRST_COMPLETED)
             if message.done() and not left.done():
+                if self._wide:
+                    self._room.release()
                 return message.result()
             if left.done():
                 raise ClientDisconnect
@@ -261,8 +274,13 @@ class Inbox:
 
     async def _fill(self) -> None:
         try:
-            while (event := await self._websocket.receive())["type"] == "websocket.receive":
+            while True:
+                await self._room.acquire()  # before it is received: no message waits in a hand
+                event = await self._websocket.receive()
+                if event["type"] != "websocket.receive":
+                    break
                 text: str | None = event.get("text")
-                await self._messages.put(event["bytes"] if text is None else text)
+                self._messages.put_nowait(event["bytes"] if text is None else text)
+                del event, text
         finally:
             self.left.set()
