@@ -25,6 +25,7 @@ from viflow_anomaly_service.request_body import unless_gone
 from viflow_anomaly_service.request_log import log_fields
 from viflow_anomaly_service.service_core import ServiceCore
 from viflow_anomaly_service.socket_access import PROTOCOL, SocketAccess
+from viflow_anomaly_service.stage_times import StageClock
 from viflow_anomaly_service.streams.calls import answer_call, require_callable
 from viflow_anomaly_service.streams.schemas import StreamSetup
 from viflow_anomaly_service.streams.socket_messages import MessageReading, read_opening
@@ -150,12 +151,12 @@ class StreamSocket:
         return StreamSetup(camera=opening.camera, options=opening.options)
 
     async def _answer(self, message: str | bytes, setup: StreamSetup, number: int) -> None:
-        started, log = time.perf_counter(), dict[str, Any]()
+        started, clock = time.perf_counter(), StageClock(self._core.metrics)
         reading = MessageReading(message, setup, self._core.settings)
         request_id = f"{self._request_id}-{number}"
         status, code = int(HTTPStatus.OK), None
         try:
-            answer = await self._judged(reading, log)
+            answer = await self._judged(reading, clock)
             await self._send_text(f'{{"id":{json.dumps(reading.id)},"answer":{answer.decode()}}}')
         except Problem as problem:
             if reading.id is None:
@@ -175,10 +176,10 @@ class StreamSocket:
         finally:
             seconds = time.perf_counter() - started
             self._core.metrics.observe_request(route=ROUTE, method="MESSAGE", status=status, seconds=seconds)
-            log |= {"request_id": request_id, "status": status, "duration_ms": round(seconds * 1e3, 3)}
+            log = {**clock.log, "request_id": request_id, "status": status, "duration_ms": round(seconds * 1e3, 3)}
             logger.info("message", extra=log if code is None else {**log, "code": code})
 
-    async def _judged(self, reading: MessageReading, log: dict[str, Any]) -> bytes:
+    async def _judged(self, reading: MessageReading, clock: StageClock) -> bytes:
         self._access.charge_detection()
         models = require_callable(self._core, self._stream_id)
 
@@ -191,8 +192,7 @@ class StreamSocket:
             models,
             receive=receive,
             while_connected=lambda work: unless_gone(work, self._inbox.left.wait()),
-            log=log,
-            stages=[],  # spans are of HTTP requests
+            clock=clock,  # told to no span: those are of HTTP requests
         )
 
     def _problem(self, problem: Problem, message_id: int | str | None, request_id: str) -> dict[str, Any]:
