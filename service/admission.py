@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from typing import TypeVar
 
+from viflow_anomaly_service.detector_pool import DeadlinePassedError, DetectorPool, Job
 from viflow_anomaly_service.metrics import ServiceMetrics, ShedReason
 from viflow_anomaly_service.problems import Problem
+
+Result = TypeVar("Result")
 
 
 class AdmissionGate:
@@ -58,6 +62,17 @@ class AdmissionGate:
         except TimeoutError as err:  # only ours: a request's own limits have become problems further in
             raise self._ending() from err
 
+    async def in_turn(self, pool: DetectorPool, work: Callable[[Job[Result]], Result], *, patience_s: float) -> Result:
+        """The result of the work of one who is inside, from a worker's thread.
+
+        Raises:
+            Problem: 503 ``overloaded``: no worker came in time; the work will not be done.
+        """
+        try:
+            return await pool.run(work, within_s=patience_s)
+        except DeadlinePassedError as err:
+            raise self.no_turn(patience_s) from err
+
     def require_open(self) -> None:
         """Nothing, unless the service is ending.
 
@@ -81,6 +96,10 @@ class AdmissionGate:
         """Count a refusal and say it."""
         self._metrics.shed.labels(reason).inc()
         return Problem(503, code="overloaded", detail=f"The service is busy: {found}.", retry_after_s=1)
+
+    def no_turn(self, patience_s: float) -> Problem:
+        """Count a wait that was too long and say it."""
+        return self.shed("deadline", f"no turn came within {patience_s:g} s")
 
     def _ending(self) -> Problem:
         self._metrics.shed.labels("shutting_down").inc()

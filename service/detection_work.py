@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
-
 from viflow_anomaly.detection import Detection, to_json
 from viflow_anomaly.errors import ViflowError
 from viflow_anomaly_service.detection_request import read_pair
 from viflow_anomaly_service.detector_pool import Job
-from viflow_anomaly_service.metrics import ServiceMetrics, Stage
+from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.models.table import ModelSet
 from viflow_anomaly_service.problems import problem_of_error
 from viflow_anomaly_service.settings import ServiceSettings
-from viflow_anomaly_service.stage_times import StageTime
+from viflow_anomaly_service.stage_times import StageClock
 from viflow_anomaly_service.thumbnails import wanted_thumbnail
 
 
@@ -27,11 +22,10 @@ class DetectionWork:
         body: the whole body; let go of once it is decoded.
         content_type: of the body.
         settings: limits.
-        metrics: told of every stage and of the detection.
+        metrics: told of the detection.
+        clock: of the request.
 
     Attributes:
-        log: what the request's log line says of it: milliseconds by stage, status and number of regions.
-        stages: those that are over.
         detection: what the answer says; None before there is one.
         thumbnail: the picture that is kept beside it; None: there is none.
     """
@@ -44,14 +38,14 @@ class DetectionWork:
         *,
         settings: ServiceSettings,
         metrics: ServiceMetrics,
+        clock: StageClock,
     ) -> None:
         self._models = models
         self._body = body
         self._content_type = content_type
         self._settings = settings
         self._metrics = metrics
-        self.log: dict[str, Any] = {}
-        self.stages: list[StageTime] = []
+        self._clock = clock
         self.detection: Detection | None = None
         self.thumbnail: bytes | None = None
 
@@ -62,36 +56,20 @@ class DetectionWork:
             Problem: whatever is wrong with the request, with its code and field.
             AbandonedError: between two stages, when the client has gone.
         """
-        self._note("queue", job.waited_s)
-        with self._stage("decode"):
+        self._clock.note("queue", job.waited_s)
+        with self._clock.stage("decode"):
             pair, model, config, field_names = read_pair(self._models, self._body, self._content_type, self._settings)
             self._body = b""
         job.require_wanted()
-        with self._stage("detect"):
+        with self._clock.stage("detect"):
             try:
-                detection = model.detector.with_config(config).detect(pair, decode_ms=self.log["decode_ms"])
+                detection = model.detector.with_config(config).detect(pair, decode_ms=self._clock.log["decode_ms"])
             except ViflowError as err:
                 raise problem_of_error(err, field_names) from err
         self.detection = detection
         self._metrics.observe_detection(detection, model.name)
-        self._describe(detection)
+        self._clock.log |= {"detection": detection.status, "regions": len(detection.rois)}
         job.require_wanted()
-        with self._stage("encode"):
+        with self._clock.stage("encode"):
             self.thumbnail = wanted_thumbnail(self._settings, pair.source.image, detection)
             return to_json(detection).encode("utf-8")
-
-    @contextmanager
-    def _stage(self, stage: Stage) -> Iterator[None]:
-        started = time.perf_counter()
-        try:
-            yield
-        finally:
-            self._note(stage, time.perf_counter() - started)
-
-    def _note(self, stage: Stage, seconds: float) -> None:
-        self._metrics.observe_stage(stage, seconds)
-        self.log[f"{stage}_ms"] = round(seconds * 1e3, 3)
-        self.stages.append(StageTime.until_now(stage, seconds))
-
-    def _describe(self, detection: Detection) -> None:
-        self.log |= {"detection": detection.status, "regions": len(detection.rois)}

@@ -10,7 +10,8 @@ from viflow_anomaly_service.detector_pool import DetectorPool
 from viflow_anomaly_service.events.attach import EventParts
 from viflow_anomaly_service.live.pair_memory import PairMemory
 from viflow_anomaly_service.metrics import ServiceMetrics
-from viflow_anomaly_service.models.table import ModelTable
+from viflow_anomaly_service.models.table import ModelSet, ModelTable
+from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.settings import ServiceSettings
 from viflow_anomaly_service.streams.table import StreamTable
 
@@ -43,3 +44,19 @@ class ServiceCore:
     streams: StreamTable
     events: EventParts
     live: PairMemory
+
+    def require_judging(self) -> ModelSet:
+        """The models for a call, if a pair could be judged and kept at all.
+
+        Raises:
+            Problem: 503.
+        """
+        self.gate.require_open()
+        try:
+            models = self.models.require()
+        except Problem:
+            self.metrics.shed.labels("not_ready").inc()
+            raise
+        if self.keeper is not None:
+            self.keeper.require_usable()  # before a pair is judged for nothing
+        return models

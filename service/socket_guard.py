@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
+import select
+import sys
+from http import HTTPStatus
 from typing import Any, Final
 
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
@@ -25,13 +29,34 @@ def socket_options(settings: ServiceSettings) -> dict[str, Any]:
 
 
 class GuardedSocket(WebSocketsSansIOProtocol):
-    """One connection."""
+    """One connection; says in ``scope["viflow_left"]``, an event, that the peer has gone.
+
+    uvicorn says that behind the messages that wait, and does not hear of it while they keep it from reading.
+    """
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
+        self._left = asyncio.Event()
+        self._hangup: HangupWatch | None = None
         # Its own lines show query strings, and headers in debug; ours are in the request log.
         self.logger = _FaultsOnly(self.logger)  # type: ignore[assignment]
         self.conn.debug = False
+
+    def handle_connect(self, event: Any) -> None:
+        super().handle_connect(event)
+        if self.response.status_code == HTTPStatus.SWITCHING_PROTOCOLS:
+            self.scope["viflow_left"] = self._left  # type: ignore[typeddict-unknown-key]
+            self._hangup = HangupWatch(self.loop, self.transport, self._left)
+
+    def handle_close(self, event: Any) -> None:
+        self._left.set()
+        super().handle_close(event)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._left.set()
+        if self._hangup is not None:
+            self._hangup.end()
+        super().connection_lost(exc)
 
     async def run_asgi(self) -> None:
         await super().run_asgi()
@@ -50,6 +75,35 @@ class GuardedSocket(WebSocketsSansIOProtocol):
     def keepalive_timeout(self) -> None:
         super().keepalive_timeout()
         self.loop.call_later(LINGER_SECONDS, self.transport.abort)
+
+
+class HangupWatch:
+    """Hears that the other side has ended its connection, also while nothing is read of it; on Linux only.
+
+    Args:
+        loop: on which ``left`` is set.
+        transport: of the connection.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, transport: asyncio.Transport, left: asyncio.Event) -> None:
+        self._loop = loop
+        self._left = left
+        self._poll: Any = None
+        if sys.platform == "linux":
+            self._poll = select.epoll()
+            self._poll.register(transport.get_extra_info("socket").fileno(), select.EPOLLRDHUP)
+            loop.add_reader(self._poll.fileno(), self._heard)
+
+    def end(self) -> None:
+        """Before the connection's socket is closed."""
+        if self._poll is not None:
+            self._loop.remove_reader(self._poll.fileno())
+            self._poll.close()
+            self._poll = None
+
+    def _heard(self) -> None:
+        self._left.set()
+        self.end()
 
 
 class _FaultsOnly(logging.LoggerAdapter[logging.Logger]):

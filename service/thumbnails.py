@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Final
 
-import cv2
-
 from viflow_anomaly.detection import Detection
 from viflow_anomaly.drawing import draw_thumbnail
 from viflow_anomaly.sensor_data import Uint8Array
+from viflow_anomaly_service.picture_files import MEDIA_TYPES, picture_file
 from viflow_anomaly_service.settings import ServiceSettings
 
-THUMBNAIL_MEDIA_TYPE: Final = "image/jpeg"
+THUMBNAIL_MEDIA_TYPE: Final = MEDIA_TYPES["jpg"]
 LONGEST_SIDE_PX: Final = 320
 _QUALITY: Final = 80
 
@@ -28,4 +27,4 @@ def wanted_thumbnail(settings: ServiceSettings, source: Uint8Array, detection: D
     if choice == "none" or (choice == "motion" and not moves):
         return None
     picture = draw_thumbnail(source, detection, longest_side_px=LONGEST_SIDE_PX)
-    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1])
+    return picture_file(picture, "jpg", jpeg_quality=_QUALITY)

@@ -11,7 +11,7 @@ from fastapi import FastAPI, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 
 from viflow_anomaly_service.detect_endpoint import JSON_MEDIA_TYPE, accepted_content_type
-from viflow_anomaly_service.detector_pool import DeadlinePassedError, Job
+from viflow_anomaly_service.detector_pool import Job
 from viflow_anomaly_service.live.detector_description import describe_detector
 from viflow_anomaly_service.live.event_stream import EVENT_MEDIA_TYPE, pair_events, resume_after
 from viflow_anomaly_service.live.inspection_work import InspectionWork, UploadWork, json_object
@@ -27,10 +27,12 @@ from viflow_anomaly_service.live.openapi import (
     add_live_openapi,
 )
 from viflow_anomaly_service.live.pair_memory import UPLOADS, PairMemory, RememberedPair, StreamTally
-from viflow_anomaly_service.live.pictures import MEDIA_TYPES, PICTURES, PairPictures
+from viflow_anomaly_service.live.pictures import PICTURES, PairPictures
+from viflow_anomaly_service.picture_files import MEDIA_TYPES
 from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.request_body import RequestBody
 from viflow_anomaly_service.service_core import ServiceCore
+from viflow_anomaly_service.stage_times import StageClock
 
 MAX_TUNE_BYTES: Final = 64 * 1024
 
@@ -168,20 +170,19 @@ async def _inspected(core: ServiceCore, body: RequestBody, remembered: Remembere
 
 async def _uploaded(core: ServiceCore, request: Request, body: RequestBody) -> bytes:
     settings, models = core.settings, core.models.require()
-    content_type = accepted_content_type(request)
+    content_type, clock = accepted_content_type(request), StageClock(core.metrics)
     async with core.gate.admitted():
-        data = await body.read(max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
-        members, judged = await _in_turn(
-            core, body, UploadWork(models, data, content_type, settings=settings, metrics=core.metrics)
-        )
+        upload = body.read(max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
+        with clock.told_to(request.scope):
+            data = await clock.awaited("upload", upload)
+            work = UploadWork(models, data, content_type, settings=settings, metrics=core.metrics, clock=clock)
+            del data  # the work alone holds it
+            members, judged = await _in_turn(core, body, work)
     remembered = core.live.remember(UPLOADS, "", judged)
     return json_object({"stream_id": f'"{UPLOADS}"', "number": str(remembered.number), **members})
 
 
 async def _in_turn(core: ServiceCore, body: RequestBody, work: Callable[[Job[Result]], Result]) -> Result:
     """The work's result, unless the client goes first or no worker comes in time."""
-    patience_s = core.settings.queue_timeout_s
-    try:
-        return await body.while_connected(core.pool.run(work, within_s=patience_s))
-    except DeadlinePassedError as err:
-        raise core.gate.shed("deadline", f"no turn came within {patience_s:g} s") from err
+    turn = core.gate.in_turn(core.pool, work, patience_s=core.settings.queue_timeout_s)
+    return await body.while_connected(turn)

@@ -25,6 +25,7 @@ from viflow_anomaly_service.models.table import ModelSet
 from viflow_anomaly_service.problems import Problem, problem_of_error, problem_of_validation
 from viflow_anomaly_service.schemas import OptionsPart, WireModel
 from viflow_anomaly_service.settings import ServiceSettings
+from viflow_anomaly_service.stage_times import StageClock
 
 
 class InspectRequest(WireModel):
@@ -73,16 +74,25 @@ class UploadWork:
         body, content_type: of the request, as for ``POST /detect``.
         settings: limits.
         metrics: told of the detection.
+        clock: of the request.
     """
 
     def __init__(
-        self, models: ModelSet, body: bytes, content_type: str, *, settings: ServiceSettings, metrics: ServiceMetrics
+        self,
+        models: ModelSet,
+        body: bytes,
+        content_type: str,
+        *,
+        settings: ServiceSettings,
+        metrics: ServiceMetrics,
+        clock: StageClock,
     ) -> None:
         self._models = models
         self._body = body
         self._content_type = content_type
         self._settings = settings
         self._metrics = metrics
+        self._clock = clock
 
     def __call__(self, job: Job[tuple[dict[str, str], JudgedPair]]) -> tuple[dict[str, str], JudgedPair]:
         """The answer's members and what is to be remembered.
@@ -90,14 +100,18 @@ class UploadWork:
         Raises:
             Problem: whatever is wrong with the request.
         """
-        pair, model, config, field_names = read_pair(self._models, self._body, self._content_type, self._settings)
-        self._body = b""
+        self._clock.note("queue", job.waited_s)
+        with self._clock.stage("decode"):
+            pair, model, config, field_names = read_pair(self._models, self._body, self._content_type, self._settings)
+            self._body = b""
         job.require_wanted()
-        try:
-            members, judged = inspect_pair(model.detector, pair, config, view=True)
-        except ViflowError as err:
-            raise problem_of_error(err, field_names) from err
+        with self._clock.stage("detect"):
+            try:
+                members, judged = inspect_pair(model.detector, pair, config, view=True)
+            except ViflowError as err:
+                raise problem_of_error(err, field_names) from err
         self._metrics.observe_detection(judged.detection, model.name)
+        self._clock.log |= {"detection": judged.detection.status, "regions": len(judged.detection.rois)}
         return {**members, **described_changes(model.detector.config, config)}, judged
 
 

@@ -7,16 +7,13 @@ from collections import OrderedDict
 from typing import Any, Final, Literal, Protocol, cast
 from weakref import WeakValueDictionary
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
 from viflow_anomaly.errors import ViflowError
 from viflow_anomaly.pair_detector import PairDetector
 from viflow_anomaly.sensor_data import FramePair
 from viflow_anomaly_service.admission import AdmissionGate
-from viflow_anomaly_service.detector_pool import DeadlinePassedError, DetectorPool, Job
+from viflow_anomaly_service.detector_pool import DetectorPool, Job
 from viflow_anomaly_service.live.pair_memory import RememberedPair
+from viflow_anomaly_service.picture_files import picture_file
 from viflow_anomaly_service.problems import Problem, problem_of_error
 from viflow_anomaly_service.settings import ServiceSettings
 
@@ -24,8 +21,7 @@ PictureName = Literal["source", "target", "residual", "evidence", "flow", "overl
 FRAMES: Final = ("source", "target")
 MAPS: Final = ("residual", "evidence", "flow")
 PICTURES: Final = (*FRAMES, *MAPS, "overlay")
-MEDIA_TYPES: Final = {"png": "image/png", "jpg": "image/jpeg"}
-JPEG_QUALITY: Final = 85
+_JPEG_QUALITY: Final = 85
 CACHE_BYTES: Final = 32 * 1024 * 1024
 
 Key = tuple[int, str, str]
@@ -80,12 +76,9 @@ class PairPictures:
 
     async def _make(self, remembered: RememberedPair, name: str, suffix: str) -> None:
         async with self._gate.admitted():
-            try:
-                made = await self._pool.run(
-                    lambda job: _pictures(job, remembered, name, suffix), within_s=self._patience_s
-                )
-            except DeadlinePassedError as err:
-                raise self._gate.shed("deadline", f"no turn came within {self._patience_s:g} s") from err
+            made = await self._gate.in_turn(
+                self._pool, lambda job: _pictures(job, remembered, name, suffix), patience_s=self._patience_s
+            )
         for made_name, data in made.items():
             self._keep((remembered.number, made_name, suffix), data)
 
@@ -101,7 +94,7 @@ def _pictures(job: Job[dict[str, bytes]], remembered: RememberedPair, name: str,
     """In a worker's thread."""
     judged = remembered.judged
     if name in FRAMES:
-        return {name: encoded(getattr(judged.pair, name).image, suffix)}
+        return {name: picture_file(getattr(judged.pair, name).image, suffix, jpeg_quality=_JPEG_QUALITY)}
     from viflow_anomaly.drawing import draw_overlay  # noqa: PLC0415 - the pool's threads have loaded what it needs
     from viflow_anomaly.heat_maps import draw_evidence, draw_flow, draw_residual  # noqa: PLC0415
 
@@ -111,18 +104,11 @@ def _pictures(job: Job[dict[str, bytes]], remembered: RememberedPair, name: str,
         raise problem_of_error(err) from err
     job.require_wanted()
     if name == "overlay":
-        return {
-            name: encoded(draw_overlay(judged.pair.source.image, judged.detection, residual=analysis.residual), suffix)
+        made = {name: draw_overlay(judged.pair.source.image, judged.detection, residual=analysis.residual)}
+    else:
+        made = {
+            "residual": draw_residual(analysis.residual),
+            "evidence": draw_evidence(analysis.evidence, learned=analysis.learned),
+            "flow": draw_flow(analysis.flow_px),
         }
-    maps = {
-        "residual": draw_residual(analysis.residual),
-        "evidence": draw_evidence(analysis.evidence, learned=analysis.learned),
-        "flow": draw_flow(analysis.flow_px),
-    }
-    return {made: encoded(picture, suffix) for made, picture in maps.items()}
-
-
-def encoded(picture: NDArray[np.uint8], suffix: str) -> bytes:
-    """[H, W] gray or [H, W, 3] BGR as a file."""
-    quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if suffix == "jpg" else [cv2.IMWRITE_PNG_COMPRESSION, 1]
-    return bytes(cv2.imencode(f".{suffix}", picture, quality)[1])
+    return {one: picture_file(picture, suffix, jpeg_quality=_JPEG_QUALITY) for one, picture in made.items()}

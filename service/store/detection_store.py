@@ -137,7 +137,7 @@ class DetectionStore:
     def thumbnail(self, detection_id: str) -> bytes | None:
         """The image file that is kept beside a detection."""
         found = sa.select(THUMBNAILS.c.image).where(THUMBNAILS.c.detection_id == detection_id)
-        with store_failures(), self._engine.begin() as connection:
+        with self.transaction() as connection:
             image: bytes | None = connection.execute(found).scalar_one_or_none()
         return image
 

@@ -8,7 +8,6 @@ import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from itertools import zip_longest
 from typing import Final, TypeVar
 
 from prometheus_client import Counter, Gauge
@@ -134,7 +133,7 @@ class ResultKeeper:
         self.require_usable()
         records = [
             record_of(detection, body, self._new_id(), stream_id=stream_id, session_id=session_id, thumbnail=thumbnail)
-            for (detection, body), thumbnail in zip_longest(detections, thumbnails)
+            for (detection, body), thumbnail in zip(detections, thumbnails or [None] * len(detections), strict=True)
         ]
         try:
             await self._committed(records, along([record.id for record in records]))

@@ -5,15 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import time
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from typing import Any
 
-from viflow_anomaly_service.detector_pool import DeadlinePassedError
 from viflow_anomaly_service.models.table import ModelSet
 from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.service_core import ServiceCore
-from viflow_anomaly_service.stage_times import StageTime
+from viflow_anomaly_service.stage_times import StageClock
 from viflow_anomaly_service.store.query import STREAM_ID
 from viflow_anomaly_service.streams.table import LiveStream
 from viflow_anomaly_service.streams.work import JudgedCall, Reading, StreamWork
@@ -40,15 +38,7 @@ def require_callable(core: ServiceCore, stream_id: str) -> ModelSet:
     if STREAM_ID.fullmatch(stream_id) is None:
         detail = f"stream_id: expected 1 to 64 of A-Z a-z 0-9 . _ -, found {stream_id!r:.80}"
         raise Problem(422, code="stream_id_invalid", detail=detail, field="stream_id")
-    core.gate.require_open()
-    try:
-        models = core.models.require()
-    except Problem:
-        core.metrics.shed.labels("not_ready").inc()
-        raise
-    if core.keeper is not None:
-        core.keeper.require_usable()  # before a pair is judged for nothing
-    return models
+    return core.require_judging()
 
 
 async def answer_call(
@@ -58,8 +48,7 @@ async def answer_call(
     *,
     receive: Callable[[], Awaitable[Reading]],
     while_connected: Callable[[Coroutine[Any, Any, bytes]], Awaitable[bytes]],
-    log: dict[str, Any],
-    stages: list[StageTime],
+    clock: StageClock,
 ) -> bytes:
     """The answer's bytes.
 
@@ -67,14 +56,12 @@ async def answer_call(
         models: as ``require_callable`` gave them.
         receive: called once there is a place for what is sent.
         while_connected: awaits its argument, and raises if the client goes away.
-        log: told what the call came to.
-        stages: told of those that are over.
+        clock: of the call; its log is told what the call came to.
 
     Raises:
         Problem: the call is refused, or something is wrong with it; the stream then stays where it was.
         ClientDisconnect: nobody waits for the answer any more.
     """
-    settings = core.settings
     async with core.gate.admitted(), core.streams.turn(stream_id) as stream:
         reading = await receive()
         work = StreamWork(
@@ -82,35 +69,26 @@ async def answer_call(
             reading,
             known=stream.begun,
             state=stream.state,
-            settings=settings,
+            settings=core.settings,
             metrics=core.metrics,
+            clock=clock,
         )
         del reading  # the work alone holds what was sent, and lets go of it once it is decoded
-        try:
-            return await while_connected(_judged_and_kept(core, stream, work))
-        except DeadlinePassedError as err:
-            raise core.gate.shed("deadline", f"no turn came within {settings.queue_timeout_s:g} s") from err
-        finally:
-            stages.extend(work.stages)
-            log.update(work.log)
+        return await while_connected(_judged_and_kept(core, stream, work, clock))
 
 
-async def _judged_and_kept(core: ServiceCore, stream: LiveStream, work: StreamWork) -> bytes:
+async def _judged_and_kept(core: ServiceCore, stream: LiveStream, work: StreamWork, clock: StageClock) -> bytes:
     """Cancelled before the call is judged, nothing has happened; after that it is finished, whoever has gone."""
-    judged = await core.pool.run(work, within_s=core.settings.queue_timeout_s)
-    started = time.perf_counter()
+    judged = await core.gate.in_turn(core.pool, work, patience_s=core.settings.queue_timeout_s)
     finishing = asyncio.ensure_future(_kept(core, stream, judged))
     try:
-        answer = await asyncio.shield(finishing)
+        if core.keeper is None:
+            return await asyncio.shield(finishing)
+        return await clock.awaited("store", asyncio.shield(finishing))
     except asyncio.CancelledError:
         with contextlib.suppress(Problem):
             await finishing
         raise
-    if core.keeper is not None:
-        stored_s = time.perf_counter() - started
-        core.metrics.observe_stage("store", stored_s)
-        work.stages.append(StageTime.until_now("store", stored_s))
-    return answer
 
 
 def _show(core: ServiceCore, stream: LiveStream, judged: JudgedCall, ids: Sequence[str] | None) -> None:

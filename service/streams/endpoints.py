@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from functools import partial
 
 from fastapi import FastAPI, Request, Response
@@ -10,9 +9,8 @@ from fastapi.responses import JSONResponse
 
 from viflow_anomaly_service.detect_endpoint import JSON_MEDIA_TYPE, accepted_content_type
 from viflow_anomaly_service.request_body import RequestBody, answered
-from viflow_anomaly_service.request_log import log_fields
 from viflow_anomaly_service.service_core import ServiceCore
-from viflow_anomaly_service.stage_times import StageTime, stage_times
+from viflow_anomaly_service.stage_times import StageClock
 from viflow_anomaly_service.streams.calls import answer_call, require_callable, require_one_process
 from viflow_anomaly_service.streams.openapi import (
     DELETE_OPERATION,
@@ -36,25 +34,16 @@ def add_streams(app: FastAPI, core: ServiceCore) -> None:
         async with answered(body):
             models = require_callable(core, stream_id)
             content_type, settings = accepted_content_type(request), core.settings
-            stages = stage_times(request.scope)
+            clock = StageClock(core.metrics)
 
             async def receive() -> Reading:
-                started = time.perf_counter()
-                data = await body.read(max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
-                uploaded_s = time.perf_counter() - started
-                core.metrics.observe_stage("upload", uploaded_s)
-                stages.append(StageTime.until_now("upload", uploaded_s))
-                return partial(read_input, data, content_type, settings)
+                upload = body.read(max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
+                return partial(read_input, await clock.awaited("upload", upload), content_type, settings)
 
-            answer = await answer_call(
-                core,
-                stream_id,
-                models,
-                receive=receive,
-                while_connected=body.while_connected,
-                log=log_fields(request.scope),
-                stages=stages,
-            )
+            with clock.told_to(request.scope):
+                answer = await answer_call(
+                    core, stream_id, models, receive=receive, while_connected=body.while_connected, clock=clock
+                )
         return Response(answer, media_type=JSON_MEDIA_TYPE)
 
     @app.get("/streams", operation_id="listStreams", tags=["streams"], **LIST_OPERATION)

@@ -1,7 +1,8 @@
 """``/streams/{id}`` as a WebSocket: an opening message, then calls in and answers out, in order, one at a time.
 
 Each call takes the path of ``POST /streams/{id}/frames``. What a connection may have inside is small: one message at
-work, ``AHEAD`` behind it; then its socket is not read until there is room.
+work, ``AHEAD`` behind it; then its socket is not read until there is room. Before the opening message was accepted
+there is room for that one alone.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from viflow_anomaly_service.request_body import unless_gone
 from viflow_anomaly_service.request_log import log_fields
 from viflow_anomaly_service.service_core import ServiceCore
 from viflow_anomaly_service.socket_access import PROTOCOL, SocketAccess
+from viflow_anomaly_service.stage_times import StageClock
 from viflow_anomaly_service.streams.calls import answer_call, require_callable
 from viflow_anomaly_service.streams.schemas import StreamSetup
 from viflow_anomaly_service.streams.socket_messages import MessageReading, read_opening
@@ -120,6 +122,7 @@ class StreamSocket:
         async with self._inbox.filled():
             try:
                 setup = await self._opened(places, place)
+                self._inbox.widen()
                 await self._send({"opened": {"stream_id": self._stream_id}})
                 number = 0
                 while True:
@@ -148,12 +151,12 @@ class StreamSocket:
         return StreamSetup(camera=opening.camera, options=opening.options)
 
     async def _answer(self, message: str | bytes, setup: StreamSetup, number: int) -> None:
-        started, log = time.perf_counter(), dict[str, Any]()
+        started, clock = time.perf_counter(), StageClock(self._core.metrics)
         reading = MessageReading(message, setup, self._core.settings)
         request_id = f"{self._request_id}-{number}"
         status, code = int(HTTPStatus.OK), None
         try:
-            answer = await self._judged(reading, log)
+            answer = await self._judged(reading, clock)
             await self._send_text(f'{{"id":{json.dumps(reading.id)},"answer":{answer.decode()}}}')
         except Problem as problem:
             if reading.id is None:
@@ -173,10 +176,10 @@ class StreamSocket:
         finally:
             seconds = time.perf_counter() - started
             self._core.metrics.observe_request(route=ROUTE, method="MESSAGE", status=status, seconds=seconds)
-            log |= {"request_id": request_id, "status": status, "duration_ms": round(seconds * 1e3, 3)}
+            log = {**clock.log, "request_id": request_id, "status": status, "duration_ms": round(seconds * 1e3, 3)}
             logger.info("message", extra=log if code is None else {**log, "code": code})
 
-    async def _judged(self, reading: MessageReading, log: dict[str, Any]) -> bytes:
+    async def _judged(self, reading: MessageReading, clock: StageClock) -> bytes:
         self._access.charge_detection()
         models = require_callable(self._core, self._stream_id)
 
@@ -189,8 +192,7 @@ class StreamSocket:
             models,
             receive=receive,
             while_connected=lambda work: unless_gone(work, self._inbox.left.wait()),
-            log=log,
-            stages=[],  # spans are of HTTP requests
+            clock=clock,  # told to no span: those are of HTTP requests
         )
 
     def _problem(self, problem: Problem, message_id: int | str | None, request_id: str) -> dict[str, Any]:
@@ -210,17 +212,26 @@ class StreamSocket:
 
 
 class Inbox:
-    """What has arrived and waits; knows when the peer has gone, also while a message is at work.
+    """What has arrived and waits: the opening message alone, then ``AHEAD``.
 
     Attributes:
-        left: the peer has gone.
+        left: the peer has gone. Heard of also while a message is at work and others wait, unless the peer has sent more
+            than the system holds for a socket that is not read: then a ping without answer tells.
     """
 
     def __init__(self, websocket: WebSocket, closing: asyncio.Event) -> None:
         self._websocket = websocket
         self._closing = closing
-        self._messages: asyncio.Queue[str | bytes] = asyncio.Queue(AHEAD)
-        self.left = asyncio.Event()
+        self._messages: asyncio.Queue[str | bytes] = asyncio.Queue()
+        self._room = asyncio.Semaphore(1)
+        self._wide = False
+        self.left: asyncio.Event = websocket.scope.get("viflow_left") or asyncio.Event()
+
+    def widen(self) -> None:
+        """The opening message was taken and accepted."""
+        self._wide = True
+        for _ in range(AHEAD):
+            self._room.release()
 
     @contextlib.asynccontextmanager
     async def filled(self) -> AsyncIterator[None]:
@@ -249,6 +260,8 @@ class Inbox:
         try:
             await asyncio.wait({message, left, closing}, timeout=patience_s, return_when=asyncio.FIRST_COMPLETED)
             if message.done() and not left.done():
+                if self._wide:
+                    self._room.release()
                 return message.result()
             if left.done():
                 raise ClientDisconnect
@@ -261,8 +274,13 @@ class Inbox:
 
     async def _fill(self) -> None:
         try:
-            while (event := await self._websocket.receive())["type"] == "websocket.receive":
+            while True:
+                await self._room.acquire()  # before it is received: no message waits in a hand
+                event = await self._websocket.receive()
+                if event["type"] != "websocket.receive":
+                    break
                 text: str | None = event.get("text")
-                await self._messages.put(event["bytes"] if text is None else text)
+                self._messages.put_nowait(event["bytes"] if text is None else text)
+                del event, text
         finally:
             self.left.set()

@@ -166,7 +166,7 @@ class StreamTable:
                     async with asyncio.timeout(max(0.0, deadline - time.monotonic())):
                         await stream.turn.acquire()
                 except TimeoutError as err:
-                    raise self._gate.shed("deadline", f"no turn came within {patience_s:g} s") from err
+                    raise self._gate.no_turn(patience_s) from err
                 try:
                     if not stream.gone:
                         yield stream

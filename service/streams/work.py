@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, cast
+from typing import Protocol, cast
 
 from pydantic import ValidationError
 
@@ -20,11 +18,11 @@ from viflow_anomaly.sensor_data import FramePair
 from viflow_anomaly.stream import DetectionStream, Judged, PairJudge, StreamConfig, StreamState, StreamStep
 from viflow_anomaly_service.detector_pool import Job
 from viflow_anomaly_service.live.pair_memory import JudgedPair
-from viflow_anomaly_service.metrics import ServiceMetrics, Stage
+from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.models.table import LoadedModel, ModelSet
 from viflow_anomaly_service.problems import Problem, problem_of_error, problem_of_validation
 from viflow_anomaly_service.settings import ServiceSettings
-from viflow_anomaly_service.stage_times import StageTime
+from viflow_anomaly_service.stage_times import StageClock
 from viflow_anomaly_service.streams.request import StreamInput
 from viflow_anomaly_service.streams.schemas import StreamSetup
 from viflow_anomaly_service.thumbnails import wanted_thumbnail
@@ -111,11 +109,8 @@ class StreamWork:
         known: what an earlier call has begun.
         state: where the stream stands.
         settings: limits.
-        metrics: told of every stage and of the detections.
-
-    Attributes:
-        log: what the request's log line says of it.
-        stages: those that are over.
+        metrics: told of the detections.
+        clock: of the call.
     """
 
     def __init__(
@@ -127,6 +122,7 @@ class StreamWork:
         state: StreamState,
         settings: ServiceSettings,
         metrics: ServiceMetrics,
+        clock: StageClock,
     ) -> None:
         self._models = models
         self._read: Reading | None = read
@@ -134,8 +130,7 @@ class StreamWork:
         self._state = state
         self._settings = settings
         self._metrics = metrics
-        self.log: dict[str, Any] = {}
-        self.stages: list[StageTime] = []
+        self._clock = clock
 
     def __call__(self, job: Job[JudgedCall]) -> JudgedCall:
         """The call judged.
@@ -144,34 +139,32 @@ class StreamWork:
             Problem: whatever is wrong with it; the stream then stays where it is.
             AbandonedError: between two stages, when the client has gone.
         """
-        self._note("queue", job.waited_s)
-        with self._stage("decode"):
+        self._clock.note("queue", job.waited_s)
+        with self._clock.stage("decode"):
             assert self._read is not None  # noqa: S101 - called once
             received = self._read()
             self._read = None
             begun = self._stream_of(received)
         job.require_wanted()
-        with self._stage("detect"):
+        with self._clock.stage("detect"):
             observed = ObservedJudge(begun.stream.detector)
             step = feed(replace(begun.stream, detector=observed), self._state, received)
         job.require_wanted()
-        with self._stage("encode"):
+        with self._clock.stage("encode"):
             bodies = [to_json(detection) for detection in step.detections]
-            thumbnails = self._thumbnails(received, step)
+            thumbnails = [
+                wanted_thumbnail(self._settings, pair.source.image, detection)
+                for (pair, _), detection in zip(observed.seen, step.detections, strict=True)
+            ]
         for detection in step.detections:
             self._metrics.observe_detection(detection, begun.model.name)
-        self.log |= {"pairs": len(bodies), "faults": len(step.faults)}
+        self._clock.log |= {"pairs": len(bodies), "faults": len(step.faults)}
         detector = cast(StreamJudge, begun.stream.detector).detector  # as new_stream makes it
         pairs = [
             JudgedPair(pair, detector, detection, body, signs)
             for (pair, signs), detection, body in zip(observed.seen, step.detections, bodies, strict=True)
         ]
         return JudgedCall(received, begun, step, bodies, pairs, thumbnails)
-
-    def _thumbnails(self, received: StreamInput, step: StreamStep) -> list[bytes | None]:
-        frames = (*self._state.frames, *(() if received.frame is None else (received.frame,)))
-        images = {frame.timestamp_ns: frame.image for frame in frames}
-        return [wanted_thumbnail(self._settings, images[one.source_timestamp_ns], one) for one in step.detections]
 
     def _stream_of(self, received: StreamInput) -> BegunStream:
         said = received.setup
@@ -185,19 +178,6 @@ class StreamWork:
                 detail = f"{place}: expected none, or the one that the stream was begun with, found another one"
                 raise Problem(409, code="stream_setup_changed", detail=detail, field=place)
         return self._known
-
-    @contextmanager
-    def _stage(self, stage: Stage) -> Iterator[None]:
-        started = time.perf_counter()
-        try:
-            yield
-        finally:
-            self._note(stage, time.perf_counter() - started)
-
-    def _note(self, stage: Stage, seconds: float) -> None:
-        self._metrics.observe_stage(stage, seconds)
-        self.log[f"{stage}_ms"] = round(seconds * 1e3, 3)
-        self.stages.append(StageTime.until_now(stage, seconds))
 
 
 def new_stream(models: ModelSet, received: StreamInput, settings: ServiceSettings) -> BegunStream:

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from looking_on import SAMPLE, feed, sample_pair
 from rule_detector import RuleDetector
-from service_world import LiveServer, assert_problem, form_request, live_server
+from service_world import LiveServer, assert_problem, form_request, live_server, wait_until
+from test_service_metrics import scraped
 
 from viflow_anomaly.alarm_calibration import make_calibration, write_calibration
 from viflow_anomaly.alarm_footage import JudgedPair as AlarmFootage
@@ -182,6 +183,21 @@ def test_an_uploaded_pair_can_be_looked_at_like_any_other(real: LiveServer) -> N
     assert real.client.post("/inspect", content=b"x").status_code == 415
     refused = real.client.post(f"/streams/{UPLOADS}/frames", files=sample_pair())
     assert refused.json()["code"] == "stream_id_invalid"  # no stream can take the name
+
+
+def test_the_stages_of_an_uploaded_pair_are_counted_and_logged(
+    detector: AnomalyDetector, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    stages = ("upload", "queue", "decode", "detect")
+    with live_server(lambda settings: detector) as server:
+        assert server.client.post("/inspect", files=sample_pair()).status_code == 200
+        values = scraped(server)
+        assert [values["viflow_stage_seconds_count", (stage,)] for stage in stages] == [1] * 4
+        wait_until(lambda: any(vars(record).get("path") == "/inspect" for record in caplog.records))
+    (line,) = (vars(record) for record in caplog.records if vars(record).get("path") == "/inspect")
+    assert all(line[f"{stage}_ms"] >= 0 for stage in stages)
+    assert line["detection"] == "ok"
 
 
 def test_what_is_not_there_is_404(real: LiveServer) -> None:

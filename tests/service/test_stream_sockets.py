@@ -8,9 +8,11 @@ import json
 import signal
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from socket import SHUT_RDWR
 from typing import Any
 
 import pytest
@@ -26,6 +28,7 @@ from worlds import World, make_world
 
 from viflow_anomaly.sensor_data import FramePair
 from viflow_anomaly_service.api_keys import new_key
+from viflow_anomaly_service.streams.sockets import AHEAD, Inbox
 
 PROTOCOL = "viflow.v1"
 ANSWERED = ("viflow_requests_total", ("MESSAGE", "/streams/{stream_id}", "422"))
@@ -196,13 +199,14 @@ def test_a_wrong_message_is_answered_and_changes_nothing(streaming: LiveServer, 
             assert answered(socket)["answer"]["begun"] == (k == 0)
 
 
-def test_a_message_too_large_closes_with_1009(streaming: LiveServer) -> None:
+@pytest.mark.parametrize("in_fragments", [False, True])
+def test_a_message_too_large_closes_with_1009(streaming: LiveServer, in_fragments: bool) -> None:
     with opened(streaming, "large") as socket:
-        socket.send(b"x" * (256 * 1024 + 1))
-        assert closing(socket)[0] == 1009
-    with opened(streaming, "large") as socket:
-        socket.send(iter([b"x" * 1024] * 300))  # in fragments
-        assert closing(socket)[0] == 1009
+        with pytest.raises(ConnectionClosed) as closed:  # noqa: PT012 - by the sending, where the refusal is quick
+            socket.send(iter([b"x" * 1024] * 300) if in_fragments else b"x" * (256 * 1024 + 1))
+            socket.recv(30)
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.code == 1009
 
 
 def test_text_that_is_none_closes_with_1007(streaming: LiveServer) -> None:
@@ -287,6 +291,38 @@ def test_what_comes_too_fast_waits_in_the_network(world: World) -> None:
             may_go.set()
 
 
+def test_before_the_opening_is_accepted_nothing_else_is_taken_in() -> None:
+    class Sent:
+        """A peer that has sent ten messages."""
+
+        def __init__(self) -> None:
+            self.scope: dict[str, Any] = {}
+            self.messages = deque(str(number) for number in range(10))
+
+        async def receive(self) -> dict[str, Any]:
+            return {"type": "websocket.receive", "text": self.messages.popleft()}
+
+    async def settled() -> None:
+        for _ in range(50):
+            await asyncio.sleep(0)
+
+    async def take() -> None:
+        sent = Sent()
+        inbox = Inbox(sent, asyncio.Event())  # type: ignore[arg-type]
+        async with inbox.filled():
+            assert await inbox.next(30, "opening_timeout") == "0"
+            await settled()
+            assert len(sent.messages) == 9
+            inbox.widen()
+            await settled()
+            assert len(sent.messages) == 9 - AHEAD
+            assert await inbox.next(30, "idle") == "1"
+            await settled()
+            assert len(sent.messages) == 8 - AHEAD
+
+    asyncio.run(take())
+
+
 def test_who_does_not_read_answers_is_let_go() -> None:
     wrong = json.dumps({f"{number}" + "x" * 900: 1 for number in range(10)})  # a short question, a long answer
     with live_server(lambda settings: DifferenceDetector(), body_timeout_s=0.5) as server:
@@ -355,7 +391,8 @@ def test_a_wrong_name_and_other_paths(streaming: LiveServer) -> None:
 # --- ends
 
 
-def test_a_client_that_leaves_while_its_pair_is_judged(world: World) -> None:
+@pytest.mark.parametrize("waiting", [0, 3, 12])
+def test_a_client_that_leaves_while_its_pair_is_judged(world: World, waiting: int) -> None:
     may_go, judging = threading.Event(), threading.Event()
 
     def wait(pair: FramePair) -> None:
@@ -369,7 +406,9 @@ def test_a_client_that_leaves_while_its_pair_is_judged(world: World) -> None:
                     socket.send(frame_message(world, k, as_binary=True))
                 assert answered(socket)["answer"]["begun"]
                 assert judging.wait(30)
-                socket.socket.close()  # no goodbye
+                for k in range(waiting):  # also where they keep the service from reading on
+                    socket.send(frame_message(world, 2 + k % 2, as_binary=True))
+                socket.socket.shutdown(SHUT_RDWR)  # no goodbye
             wait_until(lambda: scraped(server)["viflow_websockets", ()] == 0)
         finally:
             may_go.set()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -51,6 +53,18 @@ def test_a_detection_with_motion_has_a_picture_of_it(empty_store_url: str) -> No
         still = server.post_json(json_request(**moving_square(moves=False))).headers["x-detection-id"]
         assert_problem(server.client.get(f"/detections/{still}/thumbnail"), 404, "thumbnail_not_found", None)
         assert_problem(server.client.get("/detections/17/thumbnail"), 404, "detection_not_found", None)
+
+
+def test_another_number_of_pictures_than_of_detections_is_a_fault_of_ours(tmp_path: Path) -> None:
+    detector = RuleDetector()
+    with live_server(lambda settings: detector, store_url=str(tmp_path / "x.db")) as server:
+        server.post_json(json_request())
+        pair, _ = detector.calls[0]
+        kept = [(detector.detect(pair), "{}")]
+        for thumbnails in ([None, None], [b"x", b"y", b"z"]):
+            with pytest.raises(ValueError, match="zip"):
+                asyncio.run(server.app.state.core.keeper.keep(kept, thumbnails=thumbnails))
+        assert len(server.client.get("/detections").json()["detections"]) == 1
 
 
 @pytest.mark.parametrize(("choice", "status"), [("none", 404), ("all", 200)])
