@@ -14,6 +14,10 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from viflow_anomaly_service.connection_guard import LINGER_SECONDS
 from viflow_anomaly_service.settings import ServiceSettings
 
+MAX_FRAGMENTS: Final = 1024
+"""Of one message."""
+MAX_UNREAD_BYTES: Final = 256 * 1024
+"""Of what was sent to a peer that goes on asking for more."""
 PONG_SECONDS: Final = 60.0
 """Longer than a message waits for its turn: the answer to a ping comes behind those that were sent before."""
 
@@ -47,6 +51,20 @@ class GuardedSocket(WebSocketsSansIOProtocol):
         if self.response.status_code == HTTPStatus.SWITCHING_PROTOCOLS:
             self.scope["viflow_left"] = self._left  # type: ignore[typeddict-unknown-key]
             self._hangup = HangupWatch(self.loop, self.transport, self._left)
+
+    def handle_ping(self) -> None:
+        """Pongs that nobody reads are kept by no limit of uvicorn's."""
+        if self.transport.get_write_buffer_size() > MAX_UNREAD_BYTES:
+            self.transport.abort()
+        else:
+            super().handle_ping()
+
+    def handle_cont(self, event: Any) -> None:
+        """A limit of bytes alone lets messages of empty fragments go on for ever."""
+        if len(self.frames) >= MAX_FRAGMENTS:
+            self.transport.abort()
+        else:
+            super().handle_cont(event)
 
     def handle_close(self, event: Any) -> None:
         self._left.set()

@@ -40,7 +40,7 @@ class DeliveryRefusedError(Exception):
 
 
 class SinkUnreachableError(Exception):
-    """There is no connection to the sink: nothing was attempted."""
+    """There is no connection to the sink, or no longer."""
 
 
 class Session(Protocol):
@@ -175,7 +175,9 @@ class Courier:
         attempts, state, error, wait_s = delivery.attempts + 1, _DELIVERED, None, 0.0
         try:
             await _sent(session, delivery.event)
-        except DeliveryRefusedError as err:
+        except (DeliveryRefusedError, SinkUnreachableError) as err:
+            # A connection that ends with an event on its way may end because of it: a broker's answer to what is too
+            # large, say. It counts, or that event would hold up all others for ever.
             state, error, wait_s = "pending", str(err), self._wait_s(attempts)
             if attempts >= self._attempts:
                 state = "dead"

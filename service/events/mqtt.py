@@ -19,6 +19,9 @@ from viflow_anomaly_service.events.mqtt_connection import Broker, MqttConnection
 
 logger = logging.getLogger(__name__)
 
+MAX_HANGUPS = 3
+"""Connections in a row that end while states are announced."""
+
 MQTT_NAME: Final = "mqtt"
 ONLINE: Final = "online"
 OFFLINE: Final = "offline"
@@ -88,19 +91,32 @@ class MqttSink:
         self._broker = broker
         self._topics = topics
         self._open_things = open_things
+        self._hung_up = 0
 
     @asynccontextmanager
     async def session(self) -> AsyncIterator[MqttSession]:
         will = (self._topics.availability, OFFLINE.encode())
         async with mqtt_connection(self._broker, will) as connection:
             session = MqttSession(connection, self._topics, await self._open_things())
-            await session.announce()
+            await self._announce(session)
             try:
                 yield session
             finally:
                 with contextlib.suppress(SinkUnreachableError, TimeoutError):
                     async with asyncio.timeout(FAREWELL_SECONDS):
                         await session.leave()
+
+    async def _announce(self, session: MqttSession) -> None:
+        """Unless the broker hung up on it again and again: events are not held up by that."""
+        if self._hung_up >= MAX_HANGUPS:
+            logger.warning("mqtt_states_not_announced")
+            return
+        try:
+            await session.announce()
+        except SinkUnreachableError:
+            self._hung_up += 1
+            raise
+        self._hung_up = 0
 
 
 class MqttSession:

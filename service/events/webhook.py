@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
 import hmac
 import time
@@ -19,6 +20,7 @@ from viflow_anomaly_service.events.event_record import EventRecord
 SIGNATURE_HEADER: Final = "X-Viflow-Signature"
 EVENT_ID_HEADER: Final = "X-Viflow-Event-Id"
 _READ_BYTES: Final = 64 * 1024
+_READ_SECONDS: Final = 1.0
 
 
 def signature(secret: bytes, body: bytes, time_s: int) -> str:
@@ -71,24 +73,30 @@ class WebhookSession:
             SIGNATURE_HEADER: signature(self._secret, body, int(time.time())),
             EVENT_ID_HEADER: event.event_id,
         }
+        status: int | None = None  # what follows it decides nothing: a body that is cut short, or has no end
         try:
             async with (
                 asyncio.timeout(ATTEMPT_SECONDS),
                 self._client.stream("POST", self._url, content=body, headers=headers) as answer,
             ):
+                status = answer.status_code
                 await _read_some(answer)
         except TimeoutError:
-            raise DeliveryRefusedError(f"no answer within {ATTEMPT_SECONDS:g} s") from None
+            if status is None:
+                raise DeliveryRefusedError(f"no answer within {ATTEMPT_SECONDS:g} s") from None
         except (httpx.HTTPError, httpx.InvalidURL) as err:
-            raise DeliveryRefusedError(f"no answer: {type(err).__name__}") from err  # its text may hold the URL
-        if not HTTPStatus.OK <= answer.status_code < HTTPStatus.MULTIPLE_CHOICES:
-            raise DeliveryRefusedError(f"answered {answer.status_code}")
+            if status is None:
+                raise DeliveryRefusedError(f"no answer: {type(err).__name__}") from err  # its text may hold the URL
+        if status is None or not HTTPStatus.OK <= status < HTTPStatus.MULTIPLE_CHOICES:
+            raise DeliveryRefusedError(f"answered {status}")
 
 
 async def _read_some(answer: httpx.Response) -> None:
-    """So that the connection can be kept; one who answers at length loses it."""
+    """So that the connection can be kept; one who answers at length, or slowly, loses it."""
     read = 0
-    async for part in answer.aiter_raw():
-        read += len(part)
-        if read > _READ_BYTES:
-            return
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(_READ_SECONDS):
+            async for part in answer.aiter_raw():
+                read += len(part)
+                if read > _READ_BYTES:
+                    return

@@ -29,6 +29,7 @@ class MosquittoServer:
     folder: Path
     port: int
     acl: str = ""
+    options: tuple[str, ...] = ()
     process: subprocess.Popen[bytes] | None = None
 
     @property
@@ -43,6 +44,7 @@ class MosquittoServer:
             "persistence true",
             f"persistence_location {self.folder}/",
             "allow_anonymous true",
+            *self.options,
         ]
         if os.geteuid() == 0:
             lines.append("user root")
@@ -70,14 +72,14 @@ class MosquittoServer:
 
 
 @contextlib.contextmanager
-def mosquitto_server(*, acl: str = "") -> Iterator[MosquittoServer]:
+def mosquitto_server(*, acl: str = "", options: tuple[str, ...] = ()) -> Iterator[MosquittoServer]:
     """Started, and gone afterwards; skips the test where it is not installed."""
     if find_mosquitto() is None:
         pytest.skip("Mosquitto is not installed (on Debian: apt-get install mosquitto)")
     with tempfile.TemporaryDirectory(prefix="viflow-mosquitto-", ignore_cleanup_errors=True) as name:
         with socket.create_server(("127.0.0.1", 0)) as free:
             port = free.getsockname()[1]
-        server = MosquittoServer(Path(name), port, acl)
+        server = MosquittoServer(Path(name), port, acl, options)
         server.start()
         try:
             yield server

@@ -305,6 +305,22 @@ def test_what_the_broker_refuses_is_not_delivered(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("impatient")
+def test_an_event_at_which_the_broker_hangs_up_does_not_hold_up_the_others_for_ever(tmp_path: Path) -> None:
+    with (
+        mosquitto_server(options=("max_packet_size 400",)) as broker,
+        live_server(
+            lambda settings: ScriptedDetector(),
+            **QUICK,
+            store_url=str(tmp_path / "events.db"),
+            mqtt_url=f"mqtt://127.0.0.1:{broker.port}",
+            event_delivery_attempts=2,
+        ) as server,
+    ):
+        play(server.client, "hall", ONE_EVENT)
+        wait_until(lambda: len(deliveries(server, state="dead")) == 3, seconds=60)
+
+
+@pytest.mark.usefixtures("impatient")
 def test_home_assistant_may_be_refused(tmp_path: Path) -> None:
     store = str(tmp_path / "events.db")
     with mosquitto_server(acl="topic write viflow/+/events\ntopic read #\n") as broker:

@@ -12,7 +12,8 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from socket import SHUT_RDWR
+from socket import SHUT_RDWR, SO_RCVBUF, SOL_SOCKET
+from socket import socket as new_socket
 from typing import Any
 
 import pytest
@@ -614,3 +615,44 @@ def test_no_key_and_no_query_string_in_the_log(tmp_path: Path, world: World) -> 
     assert not [record for record in serving.log if record["level"] == "error"]
     for secret in (key, "hidden"):
         assert secret not in written
+
+
+# --- peers that would fill the memory
+
+
+def raw_socket(port: int, *, receive_buffer: int | None = None) -> Any:
+    """Behind the handshake, with nobody who reads."""
+    peer = new_socket()
+    if receive_buffer is not None:
+        peer.setsockopt(SOL_SOCKET, SO_RCVBUF, receive_buffer)
+    peer.settimeout(30)
+    peer.connect(("127.0.0.1", port))
+    lines = ["GET /streams/raw HTTP/1.1", "Host: 127.0.0.1", "Upgrade: websocket", "Connection: Upgrade"]
+    lines += ["Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version: 13"]
+    peer.sendall("\r\n".join([*lines, "", ""]).encode())
+    assert b"101 Switching Protocols" in peer.recv(1024)
+    return peer
+
+
+def masked(opcode: int, payload: bytes = b"") -> bytes:
+    return bytes([opcode, 0x80 | len(payload)]) + bytes(4) + payload
+
+
+@pytest.mark.parametrize(
+    ("first", "again", "most_bytes"),
+    [
+        (b"", masked(0x89, bytes(125)) * 512, 64 * 1024 * 1024),  # pings, whose pongs nobody reads
+        (masked(0x01, b"{"), masked(0x00) * 1024, 4 * 1024 * 1024),  # a message of empty fragments
+    ],
+)
+def test_a_peer_that_only_fills_memory_is_cut_off(
+    streaming: LiveServer, first: bytes, again: bytes, most_bytes: int
+) -> None:
+    with contextlib.closing(raw_socket(streaming.port, receive_buffer=4096)) as peer:
+        sent = 0
+        with pytest.raises(OSError, match=r"reset|Broken pipe"):  # noqa: PT012 - at which of them nobody knows
+            peer.sendall(first)
+            while sent < most_bytes:
+                peer.sendall(again)
+                sent += len(again)
+    assert streaming.client.get("/healthz").status_code == 200
