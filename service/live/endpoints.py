@@ -175,6 +175,7 @@ async def _uploaded(core: ServiceCore, request: Request, body: RequestBody) -> b
             core, body, UploadWork(models, data, content_type, settings=settings, metrics=core.metrics)
         )
     remembered = core.live.remember(UPLOADS, "", judged)
+    core.live.ended(UPLOADS)  # its model may have been let go meanwhile
     return json_object({"stream_id": f'"{UPLOADS}"', "number": str(remembered.number), **members})
 
 

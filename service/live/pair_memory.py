@@ -10,15 +10,17 @@ import contextlib
 import json
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final
+from weakref import WeakSet
 
 from viflow_anomaly.detection import Detection
 from viflow_anomaly.inspection import PairSigns
 from viflow_anomaly.pair_detector import PairDetector
 from viflow_anomaly.sensor_data import FramePair
 from viflow_anomaly_service.metrics import ServiceMetrics
+from viflow_anomaly_service.models.table import LoadedModel
 from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.settings import ServiceSettings
 
@@ -34,12 +36,14 @@ class JudgedPair:
 
     Attributes:
         pair: what the detector was given, corrected by the rig's estimate.
+        model: whose detector it was; it counts as one in memory as long as its pairs are remembered.
         detector: with the configuration it was judged under.
         detection, body: the answer, and its JSON.
         signs: of the IMU and the correction.
     """
 
     pair: FramePair
+    model: LoadedModel
     detector: PairDetector
     detection: Detection
     body: str
@@ -122,6 +126,7 @@ class PairMemory:
         self._most_bytes = settings.live_bytes
         self._pairs: dict[int, RememberedPair] = {}
         self._tallies: dict[str, StreamTally] = {}
+        self._models_gone: WeakSet[LoadedModel] = WeakSet()
         self._total_bytes = 0
         self._last_number = time.time_ns() // 1_000_000  # later than any of a former process, exact in a double
         self._changed = asyncio.Event()
@@ -165,10 +170,18 @@ class PairMemory:
 
     def forget(self, stream_id: str) -> None:
         """All pairs of a stream."""
+        self._drop_all(one for one in self._pairs.values() if one.stream_id == stream_id)
+
+    def forget_model(self, model: LoadedModel) -> None:
+        """All pairs of a model that was unloaded or replaced: they would keep its weights in memory."""
+        self._models_gone.add(model)
+        self._drop_all(one for one in self._pairs.values() if one.judged.model is model)
+
+    def ended(self, stream_id: str) -> None:
+        """A stream judges no more: its pairs stay, but for those of models that were let go meanwhile."""
         tally = self._tallies.get(stream_id)
-        for number in tuple(tally.numbers) if tally else ():
-            self._drop(number)
-        self._bytes_gauge.set(self._total_bytes)
+        kept = [self._pairs[number] for number in tally.numbers] if tally else []
+        self._drop_all(one for one in kept if one.judged.model in self._models_gone)
 
     def streams(self) -> Iterator[tuple[str, StreamTally, RememberedPair]]:
         """Name, tally and newest pair, by name."""
@@ -241,6 +254,11 @@ class PairMemory:
         if self._followers >= MAX_FOLLOWERS:
             detail = f"expected at most {MAX_FOLLOWERS} followers at once, found one more"
             raise Problem(503, code="live_full", detail=detail, retry_after_s=5)
+
+    def _drop_all(self, pairs: Iterable[RememberedPair]) -> None:
+        for number in [one.number for one in pairs]:
+            self._drop(number)
+        self._bytes_gauge.set(self._total_bytes)
 
     def _drop(self, number: int) -> None:
         one = self._pairs.pop(number)

@@ -80,6 +80,7 @@ class ModelTable:
         settings: of the service: what is loaded at its start, and how many models there may be.
         load: makes the detector that such settings describe.
         prepare: called once with each, before anybody else may use it.
+        on_let_go: told of each that was unloaded or replaced, so that nobody keeps it without need.
         metrics: told which models there are.
         on_failure: told when one of the start could not be made; there are none then.
     """
@@ -90,12 +91,14 @@ class ModelTable:
         load: Callable[[ServiceSettings], PairDetector],
         *,
         prepare: Callable[[PairDetector], Awaitable[None]],
+        on_let_go: Callable[[LoadedModel], Any],
         metrics: ServiceMetrics,
         on_failure: Callable[[Exception], Any],
     ) -> None:
         self._settings = settings
         self._load = load
         self._prepare = prepare
+        self._on_let_go = on_let_go
         self._metrics = metrics
         self._on_failure = on_failure
         self._current: ModelSet | None = None
@@ -184,7 +187,7 @@ class ModelTable:
             detail = f"expected another model than the default, found {name!r}; switch the default first"
             raise Problem(409, code="model_is_default", detail=detail)
         self._current = replace(current, models=tuple(one for one in current.models if one is not found))
-        self._metrics.forget_model(name, found.detector.model_info)
+        self._let_go(found)
         logger.info("model_unloaded", extra={"served_as": name})
 
     async def close(self) -> None:
@@ -222,7 +225,7 @@ class ModelTable:
         others = tuple(one for one in current.models if one.name != name)
         self._current = replace(current, models=(*others, new))
         if replaced is not None:
-            self._metrics.forget_model(name, replaced.detector.model_info)
+            self._let_go(replaced)
         self._announce(new)
         return new
 
@@ -237,6 +240,10 @@ class ModelTable:
         model = LoadedModel(name, detector)
         self._in_memory.add(model)
         return model
+
+    def _let_go(self, model: LoadedModel) -> None:
+        self._metrics.forget_model(model.name, model.detector.model_info)
+        self._on_let_go(model)
 
     def _load_ended(self, task: asyncio.Task[LoadedModel]) -> None:
         self._loading = None

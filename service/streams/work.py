@@ -161,7 +161,7 @@ class StreamWork:
             self._metrics.observe_detection(detection, begun.model.name)
         self.log |= {"pairs": len(bodies), "faults": len(step.faults)}
         pairs = [
-            JudgedPair(pair, begun.detector, detection, body, signs)
+            JudgedPair(pair, begun.model, begun.detector, detection, body, signs)
             for (pair, signs), detection, body in zip(observed.seen, step.detections, bodies, strict=True)
         ]
         return JudgedCall(received, begun, step, bodies, pairs, thumbnails)
