@@ -102,10 +102,7 @@ def add_live(app: FastAPI, core: ServiceCore) -> None:
     @app.get("/detector", operation_id="getDetector", tags=["live"], **DETECTOR_OPERATION)
     async def get_detector() -> JSONResponse:
         """What pairs are judged under: configuration, the limits of its region settings, calibration, model cards."""
-        described = await asyncio.to_thread(
-            describe_detector, core.models.require().default.detector, core.settings.calibration
-        )
-        return JSONResponse(described)
+        return JSONResponse(await asyncio.to_thread(describe_detector, core.models.require().default))
 
     add_live_openapi(app)
 

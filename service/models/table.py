@@ -13,6 +13,7 @@ import time
 import weakref
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from viflow_anomaly.errors import ViflowError
@@ -27,10 +28,11 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class LoadedModel:
-    """One of them; ``loaded_at_ns`` is Unix time."""
+    """One of them; ``loaded_at_ns`` is Unix time, ``calibration`` the file that its detector was made with."""
 
     name: str
     detector: PairDetector
+    calibration: Path | None = None
     loaded_at_ns: int = field(default_factory=time.time_ns)
 
     @property
@@ -237,7 +239,7 @@ class ModelTable:
             detail = f"sha256: expected the weights {sha256}, found {found}"
             raise Problem(409, code="model_checksum_mismatch", detail=detail, field="sha256")
         await self._prepare(detector)
-        model = LoadedModel(name, detector)
+        model = LoadedModel(name, detector, settings.calibration)
         self._in_memory.add(model)
         return model
 

@@ -25,6 +25,7 @@ from viflow_anomaly.settings import Settings, resolve_settings
 from viflow_anomaly_service.api_keys import new_key
 from viflow_anomaly_service.live.pair_memory import MAX_FOLLOWERS, UPLOADS
 from viflow_anomaly_service.live.pictures import PICTURES
+from viflow_anomaly_service.models.named import NamedModel
 
 
 @pytest.fixture(scope="module")
@@ -224,10 +225,15 @@ def test_the_detector_is_described_with_what_its_calibration_promises(tmp_path: 
     )
     path = tmp_path / "hall.json"
     write_calibration(path, made)
-    with live_server(lambda settings: RuleDetector(), calibration=path) as server:
+    other = {"night": NamedModel(checkpoint=Path("/somewhere/night.safetensors"))}
+    with live_server(lambda settings: RuleDetector(), calibration=path, models=other) as server:
         told = server.client.get("/detector").json()["calibration"]
         assert (told["budget_per_hour"], told["promised"], told["recordings"]) == (30.0, True, ["hall"])
         assert told["motion_score"] == made.motion_score
+        assert server.client.put("/models/default", json={"name": "night"}).status_code == 200
+        assert server.client.get("/detector").json()["calibration"] is None  # it is of the other model
+        assert server.client.put("/models/default", json={"name": "default"}).status_code == 200
+        assert server.client.get("/detector").json()["calibration"] == told
         path.unlink()
         assert server.client.get("/detector").json()["calibration"] is None
 
