@@ -13,7 +13,6 @@ from fastapi.responses import JSONResponse, StreamingResponse
 from viflow_anomaly_service.detect_endpoint import JSON_MEDIA_TYPE, accepted_content_type
 from viflow_anomaly_service.detector_pool import DeadlinePassedError, Job
 from viflow_anomaly_service.live.detector_description import describe_detector
-from viflow_anomaly_service.live.event_stream import EVENT_MEDIA_TYPE, pair_events, resume_after
 from viflow_anomaly_service.live.inspection_work import InspectionWork, UploadWork, json_object
 from viflow_anomaly_service.live.openapi import (
     DETECTOR_OPERATION,
@@ -27,6 +26,7 @@ from viflow_anomaly_service.live.openapi import (
     add_live_openapi,
 )
 from viflow_anomaly_service.live.pair_memory import UPLOADS, PairMemory, RememberedPair, StreamTally
+from viflow_anomaly_service.live.pair_stream import EVENT_MEDIA_TYPE, pair_events, resume_after
 from viflow_anomaly_service.live.pictures import MEDIA_TYPES, PICTURES, PairPictures
 from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.request_body import RequestBody
@@ -50,12 +50,12 @@ def add_live(app: FastAPI, core: ServiceCore) -> None:
         listed = [_overview(known.get(name), name, tally, newest) for name, tally, newest in memory.streams()]
         return JSONResponse({"newest_number": memory.newest_number, "streams": listed})
 
-    @app.get("/live/events", operation_id="followAll", tags=["live"], **EVENTS_OPERATION)
+    @app.get("/live/pairs", operation_id="followPairs", tags=["live"], **EVENTS_OPERATION)
     async def follow_all(request: Request) -> Response:
         """Every new pair of all streams, as server-sent events."""
         return _followed(core, request, None)
 
-    @app.get("/streams/{stream_id}/live", operation_id="followStream", tags=["live"], **STREAM_EVENTS_OPERATION)
+    @app.get("/streams/{stream_id}/live", operation_id="followStreamPairs", tags=["live"], **STREAM_EVENTS_OPERATION)
     async def follow_stream(request: Request, stream_id: str) -> Response:
         """Every new pair of one stream, as server-sent events."""
         return _followed(core, request, stream_id)

@@ -111,7 +111,7 @@ def test_events_resume_by_number(real: LiveServer) -> None:
         found = events_of(answer.iter_lines(), 5)
     assert [number for number, _ in found] == numbers[4:]
     assert all(data["number"] == number for number, data in found)
-    with real.client.stream("GET", "/live/events", headers={"Last-Event-ID": str(numbers[-3])}) as answer:
+    with real.client.stream("GET", "/live/pairs", headers={"Last-Event-ID": str(numbers[-3])}) as answer:
         assert [number for number, _ in events_of(answer.iter_lines(), 2)] == numbers[-2:]
     later = numbers[-1] + 10**9  # of a process whose clock was ahead
     with real.client.stream("GET", f"/streams/drone7/live?after={later}") as answer:
@@ -119,7 +119,7 @@ def test_events_resume_by_number(real: LiveServer) -> None:
 
 
 def test_a_follower_is_told_of_a_new_pair(real: LiveServer) -> None:
-    with real.client.stream("GET", "/live/events") as answer:
+    with real.client.stream("GET", "/live/pairs") as answer:
         lines = answer.iter_lines()
         assert next(lines).startswith("retry:")
         with httpx.Client(base_url=str(real.client.base_url), timeout=60, trust_env=False) as other:
@@ -198,9 +198,9 @@ def test_what_is_not_there_is_404(real: LiveServer) -> None:
 
 
 def test_parameters_of_events_are_checked(real: LiveServer) -> None:
-    assert_problem(real.client.get("/live/events?since=1"), 422, "parameter_unknown", "since")
+    assert_problem(real.client.get("/live/pairs?since=1"), 422, "parameter_unknown", "since")
     for wrong in ("x", "-1", "9" * 30, "1.5"):
-        assert_problem(real.client.get(f"/live/events?after={wrong}"), 422, "parameter_invalid", "after")
+        assert_problem(real.client.get(f"/live/pairs?after={wrong}"), 422, "parameter_invalid", "after")
 
 
 def test_the_detector_is_described(real: LiveServer) -> None:
@@ -285,7 +285,7 @@ def test_a_detector_without_maps_still_shows_its_frames() -> None:
 )
 def test_without_memory_there_is_nothing_to_look_at(settings: dict[str, Any], code: str) -> None:
     with live_server(lambda settings: RuleDetector(), **settings) as server:
-        for path in ("/live", "/live/events", "/streams/a/live", "/streams/a/pairs", "/streams/a/pairs/1/source.png"):
+        for path in ("/live", "/live/pairs", "/streams/a/live", "/streams/a/pairs", "/streams/a/pairs/1/source.png"):
             assert_problem(server.client.get(path), 501, code, None)
         assert_problem(server.client.post("/inspect", files=form_request()), 501, code, None)
         if code == "live_off":
@@ -296,7 +296,7 @@ def test_followers_are_bounded() -> None:
     with live_server(lambda settings: RuleDetector()) as server:
         memory = server.app.state.core.live
         memory._followers = MAX_FOLLOWERS
-        answer = server.client.get("/live/events")
+        answer = server.client.get("/live/pairs")
         assert_problem(answer, 503, "live_full", None)
         assert "retry-after" in answer.headers
 
@@ -321,7 +321,7 @@ def test_scopes(tmp_path: Path) -> None:
         pair = f"/streams/drone7/pairs/{number}"
         for path in ("/live", "/streams/drone7/pairs", f"{pair}/source.png", "/detector"):
             assert [status("GET", path, scope) for scope in ("read", "detect", None)] == [200, 403, 401], path
-        for path in ("/live/events", "/streams/drone7/live"):
+        for path in ("/live/pairs", "/streams/drone7/live"):
             assert [status("GET", path, scope) for scope in ("detect", None)] == [403, 401], path
         for path in (f"{pair}/inspect", "/inspect"):
             assert [status("POST", path, scope) for scope in ("read", None)] == [403, 401], path
