@@ -8,7 +8,7 @@ from http import HTTPStatus
 from typing import Any, Final, TypeVar
 
 from fastapi import FastAPI, Request, Response
-from fastapi.responses import JSONResponse, StreamingResponse
+from fastapi.responses import JSONResponse
 
 from viflow_anomaly_service.detect_endpoint import JSON_MEDIA_TYPE, accepted_content_type
 from viflow_anomaly_service.detector_pool import DeadlinePassedError, Job
@@ -25,9 +25,10 @@ from viflow_anomaly_service.live.openapi import (
     TUNE_OPERATION,
     add_live_openapi,
 )
-from viflow_anomaly_service.live.pair_memory import UPLOADS, PairMemory, RememberedPair, StreamTally
-from viflow_anomaly_service.live.pair_stream import EVENT_MEDIA_TYPE, pair_events, resume_after
+from viflow_anomaly_service.live.pair_memory import UPLOADS, RememberedPair, StreamTally
+from viflow_anomaly_service.live.pair_stream import pair_events, resume_after
 from viflow_anomaly_service.live.pictures import MEDIA_TYPES, PICTURES, PairPictures
+from viflow_anomaly_service.live_response import LiveResponse
 from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.request_body import RequestBody
 from viflow_anomaly_service.service_core import ServiceCore
@@ -138,11 +139,11 @@ def _overview(
 def _followed(core: ServiceCore, request: Request, stream_id: str | None) -> Response:
     _require_memory(core)
     core.gate.require_open()
-    memory: PairMemory = core.live
-    memory.require_place()
+    memory = core.live
     after = resume_after(request, memory.newest_number)
+    memory.enter()
     events = pair_events(memory, core.gate, after=after, stream_id=stream_id)
-    return StreamingResponse(events, media_type=EVENT_MEDIA_TYPE, headers={"X-Accel-Buffering": "no"})
+    return LiveResponse(events, leave=memory.leave, headers={"X-Accel-Buffering": "no"})
 
 
 async def _answered(request: Request, answer: Callable[[RequestBody], Any]) -> Response:

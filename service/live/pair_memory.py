@@ -10,7 +10,7 @@ import contextlib
 import json
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final
 from weakref import WeakSet
@@ -119,6 +119,9 @@ class PairMemory:
     Args:
         settings: how many of a stream, how many bytes together.
         metrics: told of the bytes.
+
+    Attributes:
+        followers: who follow now.
     """
 
     def __init__(self, settings: ServiceSettings, metrics: ServiceMetrics) -> None:
@@ -130,7 +133,7 @@ class PairMemory:
         self._total_bytes = 0
         self._last_number = time.time_ns() // 1_000_000  # later than any of a former process, exact in a double
         self._changed = asyncio.Event()
-        self._followers = 0
+        self.followers = 0
         self._bytes_gauge = metrics.gauge("viflow_live_bytes", "Images and IMU samples of remembered pairs")
 
     @property
@@ -231,29 +234,20 @@ class PairMemory:
             async with asyncio.timeout(seconds):
                 await self._changed.wait()
 
-    @contextlib.asynccontextmanager
-    async def followed(self) -> AsyncIterator[None]:
-        """One of the followers.
+    def enter(self) -> None:
+        """One more follower, until ``leave``.
 
         Raises:
             Problem: 503 ``live_full``.
         """
-        self.require_place()
-        self._followers += 1
-        try:
-            yield
-        finally:
-            self._followers -= 1
-
-    def require_place(self) -> None:
-        """Nothing, while one more may follow.
-
-        Raises:
-            Problem: 503 ``live_full``.
-        """
-        if self._followers >= MAX_FOLLOWERS:
+        if self.followers >= MAX_FOLLOWERS:
             detail = f"expected at most {MAX_FOLLOWERS} followers at once, found one more"
             raise Problem(503, code="live_full", detail=detail, retry_after_s=5)
+        self.followers += 1
+
+    def leave(self) -> None:
+        """A follower that has entered is gone."""
+        self.followers -= 1
 
     def _drop_all(self, pairs: Iterable[RememberedPair]) -> None:
         for number in [one.number for one in pairs]:

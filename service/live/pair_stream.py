@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from typing import Final
 
 from fastapi import Request
@@ -12,7 +12,6 @@ from viflow_anomaly_service.admission import AdmissionGate
 from viflow_anomaly_service.live.pair_memory import PairMemory
 from viflow_anomaly_service.problems import Problem
 
-EVENT_MEDIA_TYPE: Final = "text/event-stream"
 LOOK_SECONDS: Final = 0.5
 """How soon an ending service lets its followers go."""
 BEATS_BETWEEN: Final = 20
@@ -42,19 +41,18 @@ def resume_after(request: Request, newest: int) -> int:
 
 async def pair_events(
     memory: PairMemory, gate: AdmissionGate, *, after: int, stream_id: str | None
-) -> AsyncIterator[bytes]:
+) -> AsyncGenerator[bytes, None]:
     """Events from a number on, until the client goes or the service ends."""
-    async with memory.followed():
-        yield HELLO
-        silent = 0
-        while not gate.closed:
-            found, after = memory.after(after, stream_id), memory.newest_number
-            for one in found:
-                yield f"id: {one.number}\nevent: pair\ndata: {one.to_json()}\n\n".encode()
-                await asyncio.sleep(0)
-            silent = 0 if found else silent + 1
-            if silent >= BEATS_BETWEEN:
-                silent = 0
-                yield b": alive\n\n"
-            if memory.newest_number == after:
-                await memory.wait(LOOK_SECONDS)
+    yield HELLO
+    silent = 0
+    while not gate.closed:
+        found, after = memory.after(after, stream_id), memory.newest_number
+        for one in found:
+            yield f"id: {one.number}\nevent: pair\ndata: {one.to_json()}\n\n".encode()
+            await asyncio.sleep(0)
+        silent = 0 if found else silent + 1
+        if silent >= BEATS_BETWEEN:
+            silent = 0
+            yield b": alive\n\n"
+        if memory.newest_number == after:
+            await memory.wait(LOOK_SECONDS)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import tomllib
-from collections.abc import Iterator
+from collections.abc import AsyncGenerator, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ import numpy as np
 import pytest
 from looking_on import SAMPLE, feed, sample_pair
 from rule_detector import RuleDetector
-from service_world import LiveServer, assert_problem, form_request, live_server
+from service_world import LiveServer, assert_problem, form_request, live_server, wait_until
 
 from viflow_anomaly.alarm_calibration import make_calibration, write_calibration
 from viflow_anomaly.alarm_footage import JudgedPair as AlarmFootage
@@ -25,6 +27,7 @@ from viflow_anomaly.settings import Settings, resolve_settings
 from viflow_anomaly_service.api_keys import new_key
 from viflow_anomaly_service.live.pair_memory import MAX_FOLLOWERS, UPLOADS
 from viflow_anomaly_service.live.pictures import PICTURES
+from viflow_anomaly_service.live_response import LiveResponse
 from viflow_anomaly_service.models.named import NamedModel
 
 
@@ -295,10 +298,49 @@ def test_without_memory_there_is_nothing_to_look_at(settings: dict[str, Any], co
 def test_followers_are_bounded() -> None:
     with live_server(lambda settings: RuleDetector()) as server:
         memory = server.app.state.core.live
-        memory._followers = MAX_FOLLOWERS
-        answer = server.client.get("/live/pairs")
-        assert_problem(answer, 503, "live_full", None)
-        assert "retry-after" in answer.headers
+        with ExitStack() as following:
+            clients = following.enter_context(
+                httpx.Client(base_url=server.client.base_url, timeout=60, trust_env=False)
+            )
+            for _ in range(MAX_FOLLOWERS):
+                answer = following.enter_context(clients.stream("GET", "/live/pairs"))
+                assert answer.status_code == 200
+            answer = server.client.get("/live/pairs")
+            assert_problem(answer, 503, "live_full", None)
+            assert "retry-after" in answer.headers
+        wait_until(lambda: memory.followers == 0)
+        with server.client.stream("GET", "/live/pairs") as answer:
+            assert answer.status_code == 200
+
+
+def test_a_place_is_free_at_once_when_sending_is_cancelled() -> None:
+    left: list[bool] = []
+
+    async def parts() -> AsyncGenerator[bytes, None]:
+        try:
+            yield b": one\n\n"
+        finally:
+            left.append(False)
+
+    async def cancelled_in_send() -> None:
+        sending = asyncio.Event()
+
+        async def receive() -> Any:
+            await asyncio.Event().wait()
+
+        async def send(message: Any) -> None:
+            if message["type"] == "http.response.body":
+                sending.set()
+                await asyncio.Event().wait()
+
+        response = LiveResponse(parts(), leave=lambda: left.append(True))
+        task = asyncio.ensure_future(response({"type": "http", "asgi": {}}, receive, send))
+        await sending.wait()
+        task.cancel()
+        await asyncio.wait({task})
+        assert left == [False, True]  # the generator ends first, nobody waits for garbage to be collected
+
+    asyncio.run(cancelled_in_send())
 
 
 def test_scopes(tmp_path: Path) -> None:
