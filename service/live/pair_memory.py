@@ -216,8 +216,12 @@ class PairMemory:
             raise Problem(404, code="pair_not_found", detail=detail)
         return found
 
-    def after(self, number: int, stream_id: str | None) -> list[RememberedPair]:
-        """What is newer, of one stream or of all, oldest first."""
+    def find(self, number: int) -> RememberedPair | None:
+        """One pair, if it is still remembered."""
+        return self._pairs.get(number)
+
+    def numbers_after(self, number: int, stream_id: str | None) -> list[int]:
+        """Of what is newer, of one stream or of all, oldest first."""
         if number >= self._last_number:
             return []
         found = []
@@ -225,7 +229,7 @@ class PairMemory:
             if one.number <= number:
                 break
             if stream_id in (None, one.stream_id):
-                found.append(one)
+                found.append(one.number)
         return found[::-1]
 
     async def wait(self, seconds: float) -> None:

@@ -46,13 +46,20 @@ async def pair_events(
     yield HELLO
     silent = 0
     while not gate.closed:
-        found, after = memory.after(after, stream_id), memory.newest_number
-        for one in found:
-            yield f"id: {one.number}\nevent: pair\ndata: {one.to_json()}\n\n".encode()
-            await asyncio.sleep(0)
+        found, after = memory.numbers_after(after, stream_id), memory.newest_number
+        for number in found:
+            if event := _event(memory, number):
+                yield event
+                await asyncio.sleep(0)
         silent = 0 if found else silent + 1
         if silent >= BEATS_BETWEEN:
             silent = 0
             yield b": alive\n\n"
         if memory.newest_number == after:
             await memory.wait(LOOK_SECONDS)
+
+
+def _event(memory: PairMemory, number: int) -> bytes:
+    """Nothing of a pair that has gone since; apart, because who yields would hold its images while the client reads."""
+    one = memory.find(number)
+    return b"" if one is None else f"id: {number}\nevent: pair\ndata: {one.to_json()}\n\n".encode()

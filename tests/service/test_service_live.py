@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import json
 import tomllib
+import weakref
 from collections.abc import AsyncGenerator, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -26,6 +28,7 @@ from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.settings import Settings, resolve_settings
 from viflow_anomaly_service.api_keys import new_key
 from viflow_anomaly_service.live.pair_memory import MAX_FOLLOWERS, UPLOADS
+from viflow_anomaly_service.live.pair_stream import pair_events
 from viflow_anomaly_service.live.pictures import PICTURES
 from viflow_anomaly_service.live_response import LiveResponse
 from viflow_anomaly_service.models.named import NamedModel
@@ -263,6 +266,25 @@ def test_memory_is_bounded_in_pairs_and_bytes(detector: AnomalyDetector) -> None
         feed(server.client, "second", calls=3)
         assert [one["stream_id"] for one in server.client.get("/live").json()["streams"]] == ["second"]
         assert len(pairs_of(server, "second")) == 2
+
+
+def test_a_follower_who_reads_nothing_holds_no_pairs() -> None:
+    with live_server(lambda settings: RuleDetector()) as server:
+        feed(server.client, calls=5)
+        core = server.app.state.core
+
+        async def held() -> int:
+            events = pair_events(core.live, core.gate, after=0, stream_id=None)
+            assert (await anext(events)).startswith(b"retry:")
+            assert b"event: pair" in await anext(events)  # which the client has not taken yet
+            alive = weakref.WeakSet(core.live.newest_first("drone7"))
+            core.live.forget("drone7")
+            gc.collect()
+            held = len(alive)
+            await events.aclose()
+            return held
+
+        assert asyncio.run_coroutine_threadsafe(held(), server.loop).result(20) == 0
 
 
 def test_a_deleted_stream_is_not_shown_any_more() -> None:
