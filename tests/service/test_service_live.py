@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
+import threading
 import tomllib
 import weakref
 from collections.abc import AsyncGenerator, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ import cv2
 import httpx
 import numpy as np
 import pytest
-from looking_on import SAMPLE, feed, sample_pair
+from looking_on import SAMPLE, feed, sample_calls, sample_pair
 from rule_detector import RuleDetector
 from service_world import LiveServer, assert_problem, form_request, live_server, wait_until
 
@@ -291,6 +293,21 @@ def test_a_deleted_stream_is_not_shown_any_more() -> None:
     with live_server(lambda settings: RuleDetector()) as server:
         feed(server.client, calls=3)
         assert server.client.delete("/streams/drone7").status_code == 204
+        assert server.client.get("/live").json()["streams"] == []
+
+
+def test_a_stream_that_is_deleted_during_a_call_does_not_come_back() -> None:
+    may_go, calls = threading.Event(), []  # type: ignore[var-annotated]
+    detector = RuleDetector(may_go=may_go, calls=calls)
+    with live_server(lambda settings: detector) as server, ThreadPoolExecutor(1) as pool, ExitStack() as ending:
+        ending.callback(may_go.set)
+        first, second, *_ = sample_calls()
+        assert server.client.post("/streams/drone7/frames", files=first).status_code == 200
+        at_work = pool.submit(server.client.post, "/streams/drone7/frames", files=second)
+        wait_until(lambda: len(calls) == 1)
+        assert server.client.delete("/streams/drone7").status_code == 204
+        may_go.set()
+        assert len(at_work.result(30).json()["detections"]) == 1
         assert server.client.get("/live").json()["streams"] == []
 
 
