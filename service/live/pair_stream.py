@@ -30,12 +30,14 @@ def resume_after(request: Request, newest: int) -> int:
     for name in request.query_params:
         if name != "after":
             raise Problem(422, code="parameter_unknown", detail=f"expected after, found {name!r:.80}", field=name[:80])
-    text = request.headers.get("last-event-id", request.query_params.get("after"))
+    place, text = "Last-Event-ID", request.headers.get("last-event-id")
+    if text is None:
+        place, text = "after", request.query_params.get("after")
     if text is None:
         return newest
     if not (text.isascii() and text.isdecimal() and len(text) <= 20):
-        detail = f"after: expected the number of a pair, found {text!r:.40}"
-        raise Problem(422, code="parameter_invalid", detail=detail, field="after")
+        detail = f"{place}: expected the number of a pair, found {text!r:.40}"
+        raise Problem(422, code="parameter_invalid", detail=detail, field=place)
     return int(text) if int(text) <= newest else 0
 
 

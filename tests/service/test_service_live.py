@@ -209,6 +209,9 @@ def test_parameters_of_events_are_checked(real: LiveServer) -> None:
     assert_problem(real.client.get("/live/pairs?since=1"), 422, "parameter_unknown", "since")
     for wrong in ("x", "-1", "9" * 30, "1.5"):
         assert_problem(real.client.get(f"/live/pairs?after={wrong}"), 422, "parameter_invalid", "after")
+    answer = real.client.get("/live/pairs?after=1", headers={"Last-Event-ID": "x"})
+    assert_problem(answer, 422, "parameter_invalid", "Last-Event-ID")
+    assert answer.json()["detail"].startswith("Last-Event-ID: ")
 
 
 def test_the_detector_is_described(real: LiveServer) -> None:
