@@ -72,8 +72,9 @@ class RememberedPair:
     def size_bytes(self) -> int:
         """Neighbours share a frame, so that less is really held."""
         pair = self.judged.pair
-        arrays = (pair.source.image, pair.target.image, pair.imu.timestamps_ns, pair.imu.gyro_rad_s)
-        return sum(array.nbytes for array in arrays) + len(self.judged.body) + _PAIR_OVERHEAD_BYTES
+        imu = (pair.imu.timestamps_ns, pair.imu.gyro_rad_s, pair.imu.accel_m_s2)
+        arrays = (pair.source.image, pair.target.image, *imu)
+        return sum(array.nbytes for array in arrays if array is not None) + len(self.judged.body) + _PAIR_OVERHEAD_BYTES
 
     def to_json(self) -> str:
         """As listed and followed; the detection is what was answered, to the byte."""

@@ -11,6 +11,7 @@ import weakref
 from collections.abc import AsyncGenerator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -271,6 +272,14 @@ def test_memory_is_bounded_in_pairs_and_bytes(detector: AnomalyDetector) -> None
         feed(server.client, "second", calls=3)
         assert [one["stream_id"] for one in server.client.get("/live").json()["streams"]] == ["second"]
         assert len(pairs_of(server, "second")) == 2
+
+
+def test_all_imu_samples_count(real: LiveServer) -> None:
+    (one, *_) = real.app.state.core.live.newest_first("drone7")
+    pair = one.judged.pair
+    assert pair.imu.accel_m_s2 is not None
+    without = replace(one.judged, pair=replace(pair, imu=replace(pair.imu, accel_m_s2=None)))
+    assert replace(one, judged=without).size_bytes == one.size_bytes - pair.imu.accel_m_s2.nbytes
 
 
 def test_a_follower_who_reads_nothing_holds_no_pairs() -> None:
