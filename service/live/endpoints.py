@@ -159,7 +159,7 @@ async def _answered(request: Request, answer: Callable[[RequestBody], Any]) -> R
 
 async def _inspected(core: ServiceCore, body: RequestBody, remembered: RememberedPair) -> bytes:
     settings = core.settings
-    async with core.gate.admitted():
+    async with core.gate.admitted(looking_on=True):
         data = await body.read(max_bytes=MAX_TUNE_BYTES, timeout_s=settings.body_timeout_s)
         return await _in_turn(core, body, InspectionWork(remembered, data, settings))
 
@@ -167,7 +167,7 @@ async def _inspected(core: ServiceCore, body: RequestBody, remembered: Remembere
 async def _uploaded(core: ServiceCore, request: Request, body: RequestBody) -> bytes:
     settings, models = core.settings, core.models.require()
     content_type = accepted_content_type(request)
-    async with core.gate.admitted():
+    async with core.gate.admitted(looking_on=True):
         data = await body.read(max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
         members, judged = await _in_turn(
             core, body, UploadWork(models, data, content_type, settings=settings, metrics=core.metrics)

@@ -308,6 +308,33 @@ def test_a_deleted_stream_is_not_shown_any_more() -> None:
         assert server.client.get("/live").json()["streams"] == []
 
 
+def test_pictures_and_inspections_leave_half_of_the_places_to_detections() -> None:
+    may_go, calls = threading.Event(), []  # type: ignore[var-annotated]
+    may_go.set()
+    detector = RuleDetector(may_go=may_go, calls=calls)
+    with (
+        live_server(lambda settings: detector, max_concurrent=2, max_queued=2) as server,
+        ThreadPoolExecutor(4) as pool,
+        ExitStack() as ending,
+    ):
+        ending.callback(may_go.set)
+        feed(server.client, calls=3)
+        place = f"/streams/drone7/pairs/{pairs_of(server)[0]['number']}"
+        may_go.clear()
+        gate = server.app.state.core.gate
+        asked = [pool.submit(server.post_form, form_request()) for _ in range(2)]
+        wait_until(lambda: gate.present == 2)
+        assert_problem(server.client.get(f"{place}/source.png"), 503, "overloaded", None)
+        assert_problem(server.client.post(f"{place}/inspect", json={}), 503, "overloaded", None)
+        assert_problem(server.client.post("/inspect", files=form_request()), 503, "overloaded", None)
+        asked += [pool.submit(server.post_form, form_request()) for _ in range(2)]
+        wait_until(lambda: gate.present == 4)
+        may_go.set()
+        assert [one.result(30).status_code for one in asked] == [200] * 4
+        wait_until(lambda: gate.present == 0)
+        assert server.client.get(f"{place}/source.png").status_code == 200
+
+
 def test_a_stream_that_is_deleted_during_a_call_does_not_come_back() -> None:
     may_go, calls = threading.Event(), []  # type: ignore[var-annotated]
     detector = RuleDetector(may_go=may_go, calls=calls)
