@@ -30,6 +30,7 @@ from viflow_anomaly.detection import ModelInfo
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.settings import Settings, resolve_settings
 from viflow_anomaly_service.api_keys import new_key
+from viflow_anomaly_service.live import inspection_work
 from viflow_anomaly_service.live.pair_memory import MAX_FOLLOWERS, UPLOADS
 from viflow_anomaly_service.live.pair_stream import pair_events
 from viflow_anomaly_service.live.pictures import PICTURES
@@ -192,6 +193,26 @@ def test_an_uploaded_pair_can_be_looked_at_like_any_other(real: LiveServer) -> N
     assert real.client.post("/inspect", content=b"x").status_code == 415
     refused = real.client.post(f"/streams/{UPLOADS}/frames", files=sample_pair())
     assert refused.json()["code"] == "stream_id_invalid"  # no stream can take the name
+
+
+def test_an_uploaded_pair_keeps_no_model_that_was_unloaded_meanwhile(
+    detector: AnomalyDetector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inspected = inspection_work.inspect_pair
+    night = {"night": NamedModel(checkpoint=Path("/somewhere/night.safetensors"))}
+    with live_server(lambda settings: detector, models=night) as server:
+
+        def unloaded_meanwhile(*args: Any, **options: Any) -> Any:
+            with httpx.Client(base_url=server.client.base_url, timeout=60, trust_env=False) as other:
+                assert other.delete("/models/night").status_code == 204
+            return inspected(*args, **options)
+
+        monkeypatch.setattr(inspection_work, "inspect_pair", unloaded_meanwhile)
+        parts = sample_pair()
+        said = json.loads(parts["request"][1]) | {"options": {"model": "night"}}
+        answer = server.client.post("/inspect", files=parts | {"request": (None, json.dumps(said), "application/json")})
+        assert answer.status_code == 200, answer.text
+        assert server.client.get("/live").json()["streams"] == []
 
 
 def test_what_is_not_there_is_404(real: LiveServer) -> None:
