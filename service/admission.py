@@ -41,8 +41,12 @@ class AdmissionGate:
         return len(self._limits)
 
     @asynccontextmanager
-    async def admitted(self) -> AsyncIterator[None]:
+    async def admitted(self, *, looking_on: bool = False) -> AsyncIterator[None]:
         """Hold one of the places.
+
+        Args:
+            looking_on: for a picture or an inspection: only while less than half of the places are taken, so that
+                the others are always there for detections.
 
         Raises:
             Problem: 503 ``overloaded``; ``shutting_down``, also for a request inside when its time has run out.
@@ -50,6 +54,8 @@ class AdmissionGate:
         self.require_open()
         if len(self._limits) >= self._places:
             raise self.shed("queue_full", f"all {self._places} places are taken")
+        if looking_on and len(self._limits) >= max(1, self._places // 2):
+            raise self.shed("queue_full", f"half of the {self._places} places are taken, the others are for detections")
         try:
             async with asyncio.timeout(None) as limit:
                 self._limits.add(limit)

@@ -19,6 +19,7 @@ from viflow_anomaly_service.detector_loading import DetectorLoader, load_bundled
 from viflow_anomaly_service.detector_pool import DetectorPool
 from viflow_anomaly_service.events.attach import configured_events
 from viflow_anomaly_service.events.endpoints import add_events
+from viflow_anomaly_service.events.event_rules import EndReason
 from viflow_anomaly_service.live.endpoints import add_live
 from viflow_anomaly_service.live.pair_memory import PairMemory
 from viflow_anomaly_service.metrics import ServiceMetrics
@@ -34,7 +35,7 @@ from viflow_anomaly_service.state_endpoints import VERSION, add_state
 from viflow_anomaly_service.store.attach import configured_keeper
 from viflow_anomaly_service.store.endpoints import add_detections
 from viflow_anomaly_service.streams.endpoints import add_streams
-from viflow_anomaly_service.streams.table import StreamTable
+from viflow_anomaly_service.streams.table import LiveStream, StreamTable
 from viflow_anomaly_service.tracing import TracingMiddleware, configured_tracing, end_tracing
 
 MEMORY_SECONDS: Final = 5.0
@@ -125,18 +126,29 @@ def _build(
 
     keeper = configured_keeper(settings, metrics)
     events = configured_events(settings, metrics, keeper, gate.closing)
+    live = PairMemory(settings, metrics)
+
+    def on_forget(stream: LiveStream, reason: EndReason) -> None:
+        events.desk.end(stream, reason)
+        live.ended(stream.stream_id)
+
     return ServiceCore(
         settings=settings,
         metrics=metrics,
         models=ModelTable(
-            settings, load_detector, prepare=warm_up_everywhere, metrics=metrics, on_failure=on_load_failure
+            settings,
+            load_detector,
+            prepare=warm_up_everywhere,
+            on_let_go=live.forget_model,
+            metrics=metrics,
+            on_failure=on_load_failure,
         ),
         gate=gate,
         pool=pool,
         keeper=keeper,
-        streams=StreamTable(settings, gate, metrics, on_forget=events.desk.end),
+        streams=StreamTable(settings, gate, metrics, on_forget=on_forget),
         events=events,
-        live=PairMemory(settings, metrics),
+        live=live,
     )
 
 

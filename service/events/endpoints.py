@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 from collections.abc import AsyncIterator
 from dataclasses import replace
@@ -11,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from fastapi import FastAPI, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
-from starlette.types import Receive, Scope, Send
 
 from viflow_anomaly_service.events.openapi import (
     DELIVERIES_OPERATION,
@@ -31,6 +29,7 @@ from viflow_anomaly_service.events.query import (
     read_live_stream,
     require_delivery_id,
 )
+from viflow_anomaly_service.live_response import LiveResponse
 from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.service_core import ServiceCore
 from viflow_anomaly_service.store.openapi import NDJSON_MEDIA_TYPE
@@ -40,29 +39,10 @@ from viflow_anomaly_service.store.record import stored_at_ns
 if TYPE_CHECKING:
     from viflow_anomaly_service.events.attach import StoredEvents
     from viflow_anomaly_service.events.delivery_store import Delivery
-    from viflow_anomaly_service.events.live import LiveReaders
-    from viflow_anomaly_service.events.log import LoggedEvent, Place
+    from viflow_anomaly_service.events.log import LoggedEvent
     from viflow_anomaly_service.store.keeper import ResultKeeper
 
 EXPORT_ROWS: Final = 500
-SSE_MEDIA_TYPE: Final = "text/event-stream"
-
-
-class LiveResponse(StreamingResponse):
-    """A reader's events; however the connection ends, the reader's place is free at once."""
-
-    def __init__(self, readers: LiveReaders, place: Place, stream_id: str | None) -> None:
-        self._readers = readers
-        self._parts = readers.read(place, stream_id)
-        headers = {"X-Accel-Buffering": "no"}  # nginx would hold events back until it has many
-        super().__init__(self._parts, headers=headers, media_type=SSE_MEDIA_TYPE)
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        try:
-            async with contextlib.aclosing(self._parts):
-                await super().__call__(scope, receive, send)
-        finally:
-            self._readers.leave()
 
 
 def add_events(app: FastAPI, core: ServiceCore) -> None:
@@ -96,7 +76,8 @@ def add_events(app: FastAPI, core: ServiceCore) -> None:
             detail = f"expected a store or one process (VIFLOW_WORKERS=1), found {core.settings.workers}"
             raise Problem(501, code="streams_need_one_process", detail=detail)
         place = await core.events.readers.begin(last_event_id)
-        return LiveResponse(core.events.readers, place, stream_id)
+        readers = core.events.readers
+        return LiveResponse(readers.read(place, stream_id), leave=readers.leave)
 
     _add_deliveries(app, core)
     add_events_openapi(app)

@@ -8,11 +8,13 @@ from typing import Any
 
 from viflow_anomaly.config import RegionConfig
 from viflow_anomaly.errors import ConfigError
-from viflow_anomaly.pair_detector import LoadedWeights, PairDetector
+from viflow_anomaly.pair_detector import LoadedWeights
+from viflow_anomaly_service.models.table import LoadedModel
 
 
-def describe_detector(detector: PairDetector, calibration: Path | None) -> dict[str, Any]:
+def describe_detector(model: LoadedModel) -> dict[str, Any]:
     """Plain JSON values; reads files."""
+    detector, calibration = model.detector, model.calibration
     info = detector.model_info
     return {
         "model": {"name": info.name, "version": info.version, "sha256": info.sha256},

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from http import HTTPStatus
 from typing import Any, Final, TypeVar
 
 from fastapi import FastAPI, Request, Response
-from fastapi.responses import JSONResponse, StreamingResponse
+from fastapi.responses import JSONResponse
 
 from viflow_anomaly_service.detect_endpoint import JSON_MEDIA_TYPE, accepted_content_type
 from viflow_anomaly_service.detector_pool import Job
 from viflow_anomaly_service.live.detector_description import describe_detector
-from viflow_anomaly_service.live.event_stream import EVENT_MEDIA_TYPE, pair_events, resume_after
 from viflow_anomaly_service.live.inspection_work import InspectionWork, UploadWork, json_object
 from viflow_anomaly_service.live.openapi import (
     DETECTOR_OPERATION,
@@ -26,11 +24,13 @@ from viflow_anomaly_service.live.openapi import (
     TUNE_OPERATION,
     add_live_openapi,
 )
-from viflow_anomaly_service.live.pair_memory import UPLOADS, PairMemory, RememberedPair, StreamTally
+from viflow_anomaly_service.live.pair_memory import UPLOADS, RememberedPair, StreamTally
+from viflow_anomaly_service.live.pair_stream import pair_events, resume_after
 from viflow_anomaly_service.live.pictures import PICTURES, PairPictures
+from viflow_anomaly_service.live_response import LiveResponse
 from viflow_anomaly_service.picture_files import MEDIA_TYPES
 from viflow_anomaly_service.problems import Problem
-from viflow_anomaly_service.request_body import RequestBody
+from viflow_anomaly_service.request_body import RequestBody, answered
 from viflow_anomaly_service.service_core import ServiceCore
 from viflow_anomaly_service.stage_times import StageClock
 
@@ -41,6 +41,13 @@ Result = TypeVar("Result")
 
 def add_live(app: FastAPI, core: ServiceCore) -> None:
     """Add the endpoints; without remembered pairs (several processes, ``live_pairs`` 0) most are 501."""
+    _add_pairs(app, core)
+    _add_followers(app, core)
+    _add_inspections(app, core)
+    add_live_openapi(app)
+
+
+def _add_pairs(app: FastAPI, core: ServiceCore) -> None:
     memory = core.live
     pictures = PairPictures(core.pool, core.gate, core.settings)
 
@@ -51,16 +58,6 @@ def add_live(app: FastAPI, core: ServiceCore) -> None:
         known = {stream.stream_id: stream.status() for stream in core.streams.begun()}
         listed = [_overview(known.get(name), name, tally, newest) for name, tally, newest in memory.streams()]
         return JSONResponse({"newest_number": memory.newest_number, "streams": listed})
-
-    @app.get("/live/events", operation_id="followAll", tags=["live"], **EVENTS_OPERATION)
-    async def follow_all(request: Request) -> Response:
-        """Every new pair of all streams, as server-sent events."""
-        return _followed(core, request, None)
-
-    @app.get("/streams/{stream_id}/live", operation_id="followStream", tags=["live"], **STREAM_EVENTS_OPERATION)
-    async def follow_stream(request: Request, stream_id: str) -> Response:
-        """Every new pair of one stream, as server-sent events."""
-        return _followed(core, request, stream_id)
 
     @app.get("/streams/{stream_id}/pairs", operation_id="listPairs", tags=["live"], **PAIRS_OPERATION)
     async def list_pairs(stream_id: str) -> Response:
@@ -86,30 +83,42 @@ def add_live(app: FastAPI, core: ServiceCore) -> None:
         data = await pictures.picture(memory.require(stream_id, number), name, suffix)
         return Response(data, media_type=MEDIA_TYPES[suffix])
 
+
+def _add_followers(app: FastAPI, core: ServiceCore) -> None:
+    @app.get("/live/pairs", operation_id="followPairs", tags=["live"], **EVENTS_OPERATION)
+    async def follow_all(request: Request) -> Response:
+        """Every new pair of all streams, as server-sent events."""
+        return _followed(core, request, None)
+
+    @app.get("/streams/{stream_id}/live", operation_id="followStreamPairs", tags=["live"], **STREAM_EVENTS_OPERATION)
+    async def follow_stream(request: Request, stream_id: str) -> Response:
+        """Every new pair of one stream, as server-sent events."""
+        return _followed(core, request, stream_id)
+
+
+def _add_inspections(app: FastAPI, core: ServiceCore) -> None:
     @app.post(
         "/streams/{stream_id}/pairs/{number}/inspect", operation_id="inspectPair", tags=["live"], **TUNE_OPERATION
     )
     async def inspect_pair(request: Request, stream_id: str, number: str) -> Response:
         """What a remembered pair would be judged under other options, and what decided."""
         _require_memory(core)
-        remembered = memory.require(stream_id, number)
-        return await _answered(request, lambda body: _inspected(core, body, remembered))
+        remembered, body = core.live.require(stream_id, number), RequestBody(request)
+        async with answered(body):
+            return Response(await _inspected(core, body, remembered), media_type=JSON_MEDIA_TYPE)
 
     @app.post("/inspect", operation_id="inspect", tags=["live"], **INSPECT_OPERATION)
     async def inspect(request: Request) -> Response:
         """A pair as for ``/detect``, looked at closely and remembered, so that its pictures can be asked for."""
         _require_memory(core)
-        return await _answered(request, lambda body: _uploaded(core, request, body))
+        body = RequestBody(request)
+        async with answered(body):
+            return Response(await _uploaded(core, request, body), media_type=JSON_MEDIA_TYPE)
 
     @app.get("/detector", operation_id="getDetector", tags=["live"], **DETECTOR_OPERATION)
     async def get_detector() -> JSONResponse:
         """What pairs are judged under: configuration, the limits of its region settings, calibration, model cards."""
-        described = await asyncio.to_thread(
-            describe_detector, core.models.require().default.detector, core.settings.calibration
-        )
-        return JSONResponse(described)
-
-    add_live_openapi(app)
+        return JSONResponse(await asyncio.to_thread(describe_detector, core.models.require().default))
 
 
 def _require_memory(core: ServiceCore) -> None:
@@ -143,27 +152,16 @@ def _overview(
 def _followed(core: ServiceCore, request: Request, stream_id: str | None) -> Response:
     _require_memory(core)
     core.gate.require_open()
-    memory: PairMemory = core.live
-    memory.require_place()
+    memory = core.live
     after = resume_after(request, memory.newest_number)
+    memory.enter()
     events = pair_events(memory, core.gate, after=after, stream_id=stream_id)
-    return StreamingResponse(events, media_type=EVENT_MEDIA_TYPE, headers={"X-Accel-Buffering": "no"})
-
-
-async def _answered(request: Request, answer: Callable[[RequestBody], Any]) -> Response:
-    body = RequestBody(request)
-    try:
-        return Response(await answer(body), media_type=JSON_MEDIA_TYPE)
-    except Problem as problem:
-        if problem.status != HTTPStatus.REQUEST_TIMEOUT:
-            await body.discard()
-        problem.closes_connection = not body.finished
-        raise
+    return LiveResponse(events, leave=memory.leave, headers={"X-Accel-Buffering": "no"})
 
 
 async def _inspected(core: ServiceCore, body: RequestBody, remembered: RememberedPair) -> bytes:
     settings = core.settings
-    async with core.gate.admitted():
+    async with core.gate.admitted(looking_on=True):
         data = await body.read(max_bytes=MAX_TUNE_BYTES, timeout_s=settings.body_timeout_s)
         return await _in_turn(core, body, InspectionWork(remembered, data, settings))
 
@@ -171,7 +169,7 @@ async def _inspected(core: ServiceCore, body: RequestBody, remembered: Remembere
 async def _uploaded(core: ServiceCore, request: Request, body: RequestBody) -> bytes:
     settings, models = core.settings, core.models.require()
     content_type, clock = accepted_content_type(request), StageClock(core.metrics)
-    async with core.gate.admitted():
+    async with core.gate.admitted(looking_on=True):
         upload = body.read(max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
         with clock.told_to(request.scope):
             data = await clock.awaited("upload", upload)
@@ -179,6 +177,7 @@ async def _uploaded(core: ServiceCore, request: Request, body: RequestBody) -> b
             del data  # the work alone holds it
             members, judged = await _in_turn(core, body, work)
     remembered = core.live.remember(UPLOADS, "", judged)
+    core.live.ended(UPLOADS)  # its model may have been let go meanwhile
     return json_object({"stream_id": f'"{UPLOADS}"', "number": str(remembered.number), **members})
 
 

@@ -12,7 +12,6 @@ from viflow_anomaly.config_changes import ChangedValue, as_environment, as_toml,
 from viflow_anomaly.detection import to_json
 from viflow_anomaly.errors import ViflowError
 from viflow_anomaly.inspection import flow_arrows, pair_signs, view_hypotheses
-from viflow_anomaly.pair_detector import PairDetector
 from viflow_anomaly.sensor_data import FramePair
 from viflow_anomaly.settings import ENVIRONMENT_PREFIX
 from viflow_anomaly_service.detection_request import read_pair, validated
@@ -21,7 +20,7 @@ from viflow_anomaly_service.json_body import parse_json
 from viflow_anomaly_service.live.pair_memory import JudgedPair, RememberedPair
 from viflow_anomaly_service.live.pictures import analyzing
 from viflow_anomaly_service.metrics import ServiceMetrics
-from viflow_anomaly_service.models.table import ModelSet
+from viflow_anomaly_service.models.table import LoadedModel, ModelSet
 from viflow_anomaly_service.problems import Problem, problem_of_error, problem_of_validation
 from viflow_anomaly_service.schemas import OptionsPart, WireModel
 from viflow_anomaly_service.settings import ServiceSettings
@@ -60,7 +59,7 @@ class InspectionWork:
         config = wanted_config(request.options, detector.config)
         job.require_wanted()
         try:
-            members, _ = inspect_pair(detector, self._judged.pair, config, view=request.view)
+            members, _ = inspect_pair(self._judged.model, self._judged.pair, config, view=request.view)
         except ViflowError as err:
             raise problem_of_error(err) from err
         return json_object({**members, **described_changes(detector.config, config)})
@@ -107,7 +106,7 @@ class UploadWork:
         job.require_wanted()
         with self._clock.stage("detect"):
             try:
-                members, judged = inspect_pair(model.detector, pair, config, view=True)
+                members, judged = inspect_pair(model, pair, config, view=True)
             except ViflowError as err:
                 raise problem_of_error(err, field_names) from err
         self._metrics.observe_detection(judged.detection, model.name)
@@ -131,7 +130,7 @@ def wanted_config(options: OptionsPart | None, config: DetectorConfig) -> Detect
 
 
 def inspect_pair(
-    detector: PairDetector, pair: FramePair, config: DetectorConfig, *, view: bool
+    model: LoadedModel, pair: FramePair, config: DetectorConfig, *, view: bool
 ) -> tuple[dict[str, str], JudgedPair]:
     """Members of the answer, each as JSON, and the judged pair.
 
@@ -139,7 +138,7 @@ def inspect_pair(
         InvalidInputError: as ``detect``.
         Problem: 501 ``maps_unavailable``.
     """
-    wanted = detector.with_config(config)
+    wanted = model.detector.with_config(config)
     analysis = analyzing(wanted).analyze(pair)
     detection, signs = analysis.detection, pair_signs(pair, analysis.predicted)
     body = to_json(detection)
@@ -147,7 +146,7 @@ def inspect_pair(
     if view:
         members["hypotheses"] = _json(view_hypotheses(analysis.predicted, analysis.model_input)._asdict())
         members["flow_arrows"] = _json(flow_arrows(analysis.flow_px, analysis.inside))
-    return members, JudgedPair(pair, wanted, detection, body, signs)
+    return members, JudgedPair(pair, model, wanted, detection, body, signs)
 
 
 def described_changes(before: DetectorConfig, after: DetectorConfig) -> dict[str, str]:

@@ -10,15 +10,17 @@ import contextlib
 import json
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final
+from weakref import WeakSet
 
 from viflow_anomaly.detection import Detection
 from viflow_anomaly.inspection import PairSigns
 from viflow_anomaly.pair_detector import PairDetector
 from viflow_anomaly.sensor_data import FramePair
 from viflow_anomaly_service.metrics import ServiceMetrics
+from viflow_anomaly_service.models.table import LoadedModel
 from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.settings import ServiceSettings
 
@@ -34,12 +36,14 @@ class JudgedPair:
 
     Attributes:
         pair: what the detector was given, corrected by the rig's estimate.
+        model: whose detector it was; it counts as one in memory as long as its pairs are remembered.
         detector: with the configuration it was judged under.
         detection, body: the answer, and its JSON.
         signs: of the IMU and the correction.
     """
 
     pair: FramePair
+    model: LoadedModel
     detector: PairDetector
     detection: Detection
     body: str
@@ -68,8 +72,9 @@ class RememberedPair:
     def size_bytes(self) -> int:
         """Neighbours share a frame, so that less is really held."""
         pair = self.judged.pair
-        arrays = (pair.source.image, pair.target.image, pair.imu.timestamps_ns, pair.imu.gyro_rad_s)
-        return sum(array.nbytes for array in arrays) + len(self.judged.body) + _PAIR_OVERHEAD_BYTES
+        imu = (pair.imu.timestamps_ns, pair.imu.gyro_rad_s, pair.imu.accel_m_s2)
+        arrays = (pair.source.image, pair.target.image, *imu)
+        return sum(array.nbytes for array in arrays if array is not None) + len(self.judged.body) + _PAIR_OVERHEAD_BYTES
 
     def to_json(self) -> str:
         """As listed and followed; the detection is what was answered, to the byte."""
@@ -115,6 +120,9 @@ class PairMemory:
     Args:
         settings: how many of a stream, how many bytes together.
         metrics: told of the bytes.
+
+    Attributes:
+        followers: who follow now.
     """
 
     def __init__(self, settings: ServiceSettings, metrics: ServiceMetrics) -> None:
@@ -122,10 +130,11 @@ class PairMemory:
         self._most_bytes = settings.live_bytes
         self._pairs: dict[int, RememberedPair] = {}
         self._tallies: dict[str, StreamTally] = {}
+        self._models_gone: WeakSet[LoadedModel] = WeakSet()
         self._total_bytes = 0
         self._last_number = time.time_ns() // 1_000_000  # later than any of a former process, exact in a double
         self._changed = asyncio.Event()
-        self._followers = 0
+        self.followers = 0
         self._bytes_gauge = metrics.gauge("viflow_live_bytes", "Images and IMU samples of remembered pairs")
 
     @property
@@ -165,10 +174,18 @@ class PairMemory:
 
     def forget(self, stream_id: str) -> None:
         """All pairs of a stream."""
+        self._drop_all(one for one in self._pairs.values() if one.stream_id == stream_id)
+
+    def forget_model(self, model: LoadedModel) -> None:
+        """All pairs of a model that was unloaded or replaced: they would keep its weights in memory."""
+        self._models_gone.add(model)
+        self._drop_all(one for one in self._pairs.values() if one.judged.model is model)
+
+    def ended(self, stream_id: str) -> None:
+        """A stream judges no more: its pairs stay, but for those of models that were let go meanwhile."""
         tally = self._tallies.get(stream_id)
-        for number in tuple(tally.numbers) if tally else ():
-            self._drop(number)
-        self._bytes_gauge.set(self._total_bytes)
+        kept = [self._pairs[number] for number in tally.numbers] if tally else []
+        self._drop_all(one for one in kept if one.judged.model in self._models_gone)
 
     def streams(self) -> Iterator[tuple[str, StreamTally, RememberedPair]]:
         """Name, tally and newest pair, by name."""
@@ -200,8 +217,12 @@ class PairMemory:
             raise Problem(404, code="pair_not_found", detail=detail)
         return found
 
-    def after(self, number: int, stream_id: str | None) -> list[RememberedPair]:
-        """What is newer, of one stream or of all, oldest first."""
+    def find(self, number: int) -> RememberedPair | None:
+        """One pair, if it is still remembered."""
+        return self._pairs.get(number)
+
+    def numbers_after(self, number: int, stream_id: str | None) -> list[int]:
+        """Of what is newer, of one stream or of all, oldest first."""
         if number >= self._last_number:
             return []
         found = []
@@ -209,7 +230,7 @@ class PairMemory:
             if one.number <= number:
                 break
             if stream_id in (None, one.stream_id):
-                found.append(one)
+                found.append(one.number)
         return found[::-1]
 
     async def wait(self, seconds: float) -> None:
@@ -218,29 +239,25 @@ class PairMemory:
             async with asyncio.timeout(seconds):
                 await self._changed.wait()
 
-    @contextlib.asynccontextmanager
-    async def followed(self) -> AsyncIterator[None]:
-        """One of the followers.
+    def enter(self) -> None:
+        """One more follower, until ``leave``.
 
         Raises:
             Problem: 503 ``live_full``.
         """
-        self.require_place()
-        self._followers += 1
-        try:
-            yield
-        finally:
-            self._followers -= 1
-
-    def require_place(self) -> None:
-        """Nothing, while one more may follow.
-
-        Raises:
-            Problem: 503 ``live_full``.
-        """
-        if self._followers >= MAX_FOLLOWERS:
+        if self.followers >= MAX_FOLLOWERS:
             detail = f"expected at most {MAX_FOLLOWERS} followers at once, found one more"
             raise Problem(503, code="live_full", detail=detail, retry_after_s=5)
+        self.followers += 1
+
+    def leave(self) -> None:
+        """A follower that has entered is gone."""
+        self.followers -= 1
+
+    def _drop_all(self, pairs: Iterable[RememberedPair]) -> None:
+        for number in [one.number for one in pairs]:
+            self._drop(number)
+        self._bytes_gauge.set(self._total_bytes)
 
     def _drop(self, number: int) -> None:
         one = self._pairs.pop(number)

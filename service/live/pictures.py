@@ -48,7 +48,7 @@ class PairPictures:
     """Makes pictures and remembers them.
 
     Args:
-        pool, gate: where the work is done, and who lets it in: pictures never push detections out of the line.
+        pool, gate: where the work is done, and who lets it in: half of the places are never for pictures.
         settings: how long a turn may be waited for.
     """
 
@@ -75,7 +75,7 @@ class PairPictures:
             return self._cache[key]
 
     async def _make(self, remembered: RememberedPair, name: str, suffix: str) -> None:
-        async with self._gate.admitted():
+        async with self._gate.admitted(looking_on=True):
             made = await self._gate.in_turn(
                 self._pool, lambda job: _pictures(job, remembered, name, suffix), patience_s=self._patience_s
             )

@@ -13,6 +13,7 @@ import time
 import weakref
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from viflow_anomaly.errors import ViflowError
@@ -27,10 +28,11 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class LoadedModel:
-    """One of them; ``loaded_at_ns`` is Unix time."""
+    """One of them; ``loaded_at_ns`` is Unix time, ``calibration`` the file that its detector was made with."""
 
     name: str
     detector: PairDetector
+    calibration: Path | None = None
     loaded_at_ns: int = field(default_factory=time.time_ns)
 
     @property
@@ -80,6 +82,7 @@ class ModelTable:
         settings: of the service: what is loaded at its start, and how many models there may be.
         load: makes the detector that such settings describe.
         prepare: called once with each, before anybody else may use it.
+        on_let_go: told of each that was unloaded or replaced, so that nobody keeps it without need.
         metrics: told which models there are.
         on_failure: told when one of the start could not be made; there are none then.
     """
@@ -90,12 +93,14 @@ class ModelTable:
         load: Callable[[ServiceSettings], PairDetector],
         *,
         prepare: Callable[[PairDetector], Awaitable[None]],
+        on_let_go: Callable[[LoadedModel], Any],
         metrics: ServiceMetrics,
         on_failure: Callable[[Exception], Any],
     ) -> None:
         self._settings = settings
         self._load = load
         self._prepare = prepare
+        self._on_let_go = on_let_go
         self._metrics = metrics
         self._on_failure = on_failure
         self._current: ModelSet | None = None
@@ -187,7 +192,7 @@ class ModelTable:
             detail = f"expected another model than the default, found {name!r}; switch the default first"
             raise Problem(409, code="model_is_default", detail=detail)
         self._current = replace(current, models=tuple(one for one in current.models if one is not found))
-        self._metrics.forget_model(name, found.detector.model_info)
+        self._let_go(found)
         logger.info("model_unloaded", extra={"served_as": name})
 
     async def close(self) -> None:
@@ -225,7 +230,7 @@ class ModelTable:
         others = tuple(one for one in current.models if one.name != name)
         self._current = replace(current, models=(*others, new))
         if replaced is not None:
-            self._metrics.forget_model(name, replaced.detector.model_info)
+            self._let_go(replaced)
         self._announce(new)
         return new
 
@@ -237,9 +242,13 @@ class ModelTable:
             detail = f"sha256: expected the weights {sha256}, found {found}"
             raise Problem(409, code="model_checksum_mismatch", detail=detail, field="sha256")
         await self._prepare(detector)
-        model = LoadedModel(name, detector)
+        model = LoadedModel(name, detector, settings.calibration)
         self._in_memory.add(model)
         return model
+
+    def _let_go(self, model: LoadedModel) -> None:
+        self._metrics.forget_model(model.name, model.detector.model_info)
+        self._on_let_go(model)
 
     def _load_ended(self, task: asyncio.Task[LoadedModel]) -> None:
         self._loading = None

@@ -92,8 +92,8 @@ async def _judged_and_kept(core: ServiceCore, stream: LiveStream, work: StreamWo
 
 
 def _show(core: ServiceCore, stream: LiveStream, judged: JudgedCall, ids: Sequence[str] | None) -> None:
-    """The pairs of a call to whoever looks on."""
-    if not core.live.enabled or not judged.pairs:
+    """The pairs of a call to whoever looks on, unless the stream was deleted meanwhile."""
+    if not core.live.enabled or not judged.pairs or stream.gone:
         return
     rig = judged.step.state.rig
     report = None if rig is None else rig.report(judged.begun.stream.config.rig_estimate)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol, cast
+from typing import cast
 
 from pydantic import ValidationError
 
@@ -18,6 +18,7 @@ from viflow_anomaly.sensor_data import FramePair
 from viflow_anomaly.stream import DetectionStream, Judged, PairJudge, StreamConfig, StreamState, StreamStep
 from viflow_anomaly_service.detector_pool import Job
 from viflow_anomaly_service.live.pair_memory import JudgedPair
+from viflow_anomaly_service.live.pictures import Analyzing
 from viflow_anomaly_service.metrics import ServiceMetrics
 from viflow_anomaly_service.models.table import LoadedModel, ModelSet
 from viflow_anomaly_service.problems import Problem, problem_of_error, problem_of_validation
@@ -33,10 +34,11 @@ Reading = Callable[[], StreamInput]
 
 @dataclass(frozen=True)
 class BegunStream:
-    """What the first call decides: what was said, which model judges, and the stream that asks it."""
+    """What the first call decides: what was said, which model judges, under which configuration, and the stream."""
 
     setup: StreamSetup
     model: LoadedModel
+    detector: PairDetector
     stream: DetectionStream
 
 
@@ -61,10 +63,6 @@ class JudgedCall:
     thumbnails: list[bytes | None]
 
 
-class _Analyzing(Protocol):
-    def analyze(self, pair: FramePair, *, decode_ms: float = 0.0) -> Judged: ...
-
-
 @dataclass(frozen=True)
 class _DetectionOnly:
     detection: Detection
@@ -79,7 +77,8 @@ class StreamJudge:
 
     def analyze(self, pair: FramePair, *, decode_ms: float = 0.0) -> Judged:
         if hasattr(self.detector, "analyze"):
-            return cast(_Analyzing, self.detector).analyze(pair, decode_ms=decode_ms)
+            judged: Judged = cast(Analyzing, self.detector).analyze(pair, decode_ms=decode_ms)
+            return judged
         return _DetectionOnly(self.detector.detect(pair, decode_ms=decode_ms))
 
 
@@ -159,9 +158,8 @@ class StreamWork:
         for detection in step.detections:
             self._metrics.observe_detection(detection, begun.model.name)
         self._clock.log |= {"pairs": len(bodies), "faults": len(step.faults)}
-        detector = cast(StreamJudge, begun.stream.detector).detector  # as new_stream makes it
         pairs = [
-            JudgedPair(pair, detector, detection, body, signs)
+            JudgedPair(pair, begun.model, begun.detector, detection, body, signs)
             for (pair, signs), detection, body in zip(observed.seen, step.detections, bodies, strict=True)
         ]
         return JudgedCall(received, begun, step, bodies, pairs, thumbnails)
@@ -204,7 +202,7 @@ def new_stream(models: ModelSet, received: StreamInput, settings: ServiceSetting
         except ViflowError as err:
             raise problem_of_error(err, names) from err
     config = StreamConfig(max_imu_samples=max(settings.max_imu_samples, 2))
-    return BegunStream(setup, model, DetectionStream(StreamJudge(detector), camera=camera, config=config))
+    return BegunStream(setup, model, detector, DetectionStream(StreamJudge(detector), camera=camera, config=config))
 
 
 def feed(stream: DetectionStream, state: StreamState, received: StreamInput) -> StreamStep:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import shutil
 import subprocess
 import sys
 import threading
+import weakref
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -149,6 +151,52 @@ def test_a_stream_keeps_its_model(server: LiveServer, tmp_path: Path) -> None:
     assert_problem(put_model(server, "y", checkpoint="other.json"), 409, "models_full", None)
     assert server.client.delete("/streams/a").status_code == 204
     assert put_model(server, "y", checkpoint="other.json").status_code == 200
+
+
+@pytest.mark.parametrize("unloaded_before_its_stream_ends", [False, True])
+def test_who_looks_on_keeps_no_model_in_memory(tmp_path: Path, unloaded_before_its_stream_ends: bool) -> None:
+    write_model(tmp_path, "a.json")
+    weights: weakref.WeakSet[threading.Event] = weakref.WeakSet()
+
+    def load_noted(settings: ServiceSettings) -> FileDetector:
+        made = load(settings)
+        made.may_go = threading.Event()  # which a detector shares with those of other configurations, as weights
+        made.may_go.set()
+        weights.add(made.may_go)
+        return made
+
+    with live_server(load_noted, model_dir=tmp_path, max_models=2) as running:
+        for _ in range(5):
+            answer = put_model(running, "x", checkpoint="a.json")
+            assert answer.status_code == 200, answer.text
+            running.client.post("/streams/a/frames", json=frame_call(0, options={"model": "x"}))
+            running.client.post("/streams/a/frames", json=frame_call(1))
+            if unloaded_before_its_stream_ends:
+                assert remembered(running) == 1
+                assert running.client.delete("/models/x").status_code == 204
+                assert remembered(running) == 0
+                running.client.post("/streams/a/frames", json=frame_call(2))
+            assert remembered(running) == 1
+            expire(running, "a")
+            assert remembered(running) == (0 if unloaded_before_its_stream_ends else 1)
+        gc.collect()
+        assert len(weights) <= 2
+
+
+def remembered(server: LiveServer) -> int:
+    return sum(one["remembered_pairs"] for one in server.client.get("/live").json()["streams"])
+
+
+def expire(server: LiveServer, stream_id: str) -> None:
+    """As if it had been idle for too long."""
+    streams, done = server.app.state.core.streams, threading.Event()
+
+    def forget() -> None:
+        streams.forget(streams.require(stream_id), "stream_expired")
+        done.set()
+
+    server.loop.call_soon_threadsafe(forget)
+    assert done.wait(10)
 
 
 # --- exchanging

@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
+import gc
 import json
+import threading
 import tomllib
-from collections.abc import Iterator
+import weakref
+from collections.abc import AsyncGenerator, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +19,7 @@ import cv2
 import httpx
 import numpy as np
 import pytest
-from looking_on import SAMPLE, feed, sample_pair
+from looking_on import SAMPLE, feed, sample_calls, sample_pair
 from rule_detector import RuleDetector
 from service_world import LiveServer, assert_problem, form_request, live_server, wait_until
 from test_service_metrics import scraped
@@ -24,8 +31,12 @@ from viflow_anomaly.detection import ModelInfo
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.settings import Settings, resolve_settings
 from viflow_anomaly_service.api_keys import new_key
+from viflow_anomaly_service.live import inspection_work
 from viflow_anomaly_service.live.pair_memory import MAX_FOLLOWERS, UPLOADS
+from viflow_anomaly_service.live.pair_stream import pair_events
 from viflow_anomaly_service.live.pictures import PICTURES
+from viflow_anomaly_service.live_response import LiveResponse
+from viflow_anomaly_service.models.named import NamedModel
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +122,7 @@ def test_events_resume_by_number(real: LiveServer) -> None:
         found = events_of(answer.iter_lines(), 5)
     assert [number for number, _ in found] == numbers[4:]
     assert all(data["number"] == number for number, data in found)
-    with real.client.stream("GET", "/live/events", headers={"Last-Event-ID": str(numbers[-3])}) as answer:
+    with real.client.stream("GET", "/live/pairs", headers={"Last-Event-ID": str(numbers[-3])}) as answer:
         assert [number for number, _ in events_of(answer.iter_lines(), 2)] == numbers[-2:]
     later = numbers[-1] + 10**9  # of a process whose clock was ahead
     with real.client.stream("GET", f"/streams/drone7/live?after={later}") as answer:
@@ -119,7 +130,7 @@ def test_events_resume_by_number(real: LiveServer) -> None:
 
 
 def test_a_follower_is_told_of_a_new_pair(real: LiveServer) -> None:
-    with real.client.stream("GET", "/live/events") as answer:
+    with real.client.stream("GET", "/live/pairs") as answer:
         lines = answer.iter_lines()
         assert next(lines).startswith("retry:")
         with httpx.Client(base_url=str(real.client.base_url), timeout=60, trust_env=False) as other:
@@ -200,6 +211,26 @@ def test_the_stages_of_an_uploaded_pair_are_counted_and_logged(
     assert line["detection"] == "ok"
 
 
+def test_an_uploaded_pair_keeps_no_model_that_was_unloaded_meanwhile(
+    detector: AnomalyDetector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inspected = inspection_work.inspect_pair
+    night = {"night": NamedModel(checkpoint=Path("/somewhere/night.safetensors"))}
+    with live_server(lambda settings: detector, models=night) as server:
+
+        def unloaded_meanwhile(*args: Any, **options: Any) -> Any:
+            with httpx.Client(base_url=server.client.base_url, timeout=60, trust_env=False) as other:
+                assert other.delete("/models/night").status_code == 204
+            return inspected(*args, **options)
+
+        monkeypatch.setattr(inspection_work, "inspect_pair", unloaded_meanwhile)
+        parts = sample_pair()
+        said = json.loads(parts["request"][1]) | {"options": {"model": "night"}}
+        answer = server.client.post("/inspect", files=parts | {"request": (None, json.dumps(said), "application/json")})
+        assert answer.status_code == 200, answer.text
+        assert server.client.get("/live").json()["streams"] == []
+
+
 def test_what_is_not_there_is_404(real: LiveServer) -> None:
     number = pairs_of(real)[0]["number"]
     ask = real.client.get
@@ -213,9 +244,12 @@ def test_what_is_not_there_is_404(real: LiveServer) -> None:
 
 
 def test_parameters_of_events_are_checked(real: LiveServer) -> None:
-    assert_problem(real.client.get("/live/events?since=1"), 422, "parameter_unknown", "since")
+    assert_problem(real.client.get("/live/pairs?since=1"), 422, "parameter_unknown", "since")
     for wrong in ("x", "-1", "9" * 30, "1.5"):
-        assert_problem(real.client.get(f"/live/events?after={wrong}"), 422, "parameter_invalid", "after")
+        assert_problem(real.client.get(f"/live/pairs?after={wrong}"), 422, "parameter_invalid", "after")
+    answer = real.client.get("/live/pairs?after=1", headers={"Last-Event-ID": "x"})
+    assert_problem(answer, 422, "parameter_invalid", "Last-Event-ID")
+    assert answer.json()["detail"].startswith("Last-Event-ID: ")
 
 
 def test_the_detector_is_described(real: LiveServer) -> None:
@@ -240,10 +274,15 @@ def test_the_detector_is_described_with_what_its_calibration_promises(tmp_path: 
     )
     path = tmp_path / "hall.json"
     write_calibration(path, made)
-    with live_server(lambda settings: RuleDetector(), calibration=path) as server:
+    other = {"night": NamedModel(checkpoint=Path("/somewhere/night.safetensors"))}
+    with live_server(lambda settings: RuleDetector(), calibration=path, models=other) as server:
         told = server.client.get("/detector").json()["calibration"]
         assert (told["budget_per_hour"], told["promised"], told["recordings"]) == (30.0, True, ["hall"])
         assert told["motion_score"] == made.motion_score
+        assert server.client.put("/models/default", json={"name": "night"}).status_code == 200
+        assert server.client.get("/detector").json()["calibration"] is None  # it is of the other model
+        assert server.client.put("/models/default", json={"name": "default"}).status_code == 200
+        assert server.client.get("/detector").json()["calibration"] == told
         path.unlink()
         assert server.client.get("/detector").json()["calibration"] is None
 
@@ -272,10 +311,79 @@ def test_memory_is_bounded_in_pairs_and_bytes(detector: AnomalyDetector) -> None
         assert len(pairs_of(server, "second")) == 2
 
 
+def test_all_imu_samples_count(real: LiveServer) -> None:
+    (one, *_) = real.app.state.core.live.newest_first("drone7")
+    pair = one.judged.pair
+    assert pair.imu.accel_m_s2 is not None
+    without = replace(one.judged, pair=replace(pair, imu=replace(pair.imu, accel_m_s2=None)))
+    assert replace(one, judged=without).size_bytes == one.size_bytes - pair.imu.accel_m_s2.nbytes
+
+
+def test_a_follower_who_reads_nothing_holds_no_pairs() -> None:
+    with live_server(lambda settings: RuleDetector()) as server:
+        feed(server.client, calls=5)
+        core = server.app.state.core
+
+        async def held() -> int:
+            events = pair_events(core.live, core.gate, after=0, stream_id=None)
+            assert (await anext(events)).startswith(b"retry:")
+            assert b"event: pair" in await anext(events)  # which the client has not taken yet
+            alive = weakref.WeakSet(core.live.newest_first("drone7"))
+            core.live.forget("drone7")
+            gc.collect()
+            held = len(alive)
+            await events.aclose()
+            return held
+
+        assert asyncio.run_coroutine_threadsafe(held(), server.loop).result(20) == 0
+
+
 def test_a_deleted_stream_is_not_shown_any_more() -> None:
     with live_server(lambda settings: RuleDetector()) as server:
         feed(server.client, calls=3)
         assert server.client.delete("/streams/drone7").status_code == 204
+        assert server.client.get("/live").json()["streams"] == []
+
+
+def test_pictures_and_inspections_leave_half_of_the_places_to_detections() -> None:
+    may_go, calls = threading.Event(), []  # type: ignore[var-annotated]
+    may_go.set()
+    detector = RuleDetector(may_go=may_go, calls=calls)
+    with (
+        live_server(lambda settings: detector, max_concurrent=2, max_queued=2) as server,
+        ThreadPoolExecutor(4) as pool,
+        ExitStack() as ending,
+    ):
+        ending.callback(may_go.set)
+        feed(server.client, calls=3)
+        place = f"/streams/drone7/pairs/{pairs_of(server)[0]['number']}"
+        may_go.clear()
+        gate = server.app.state.core.gate
+        asked = [pool.submit(server.post_form, form_request()) for _ in range(2)]
+        wait_until(lambda: gate.present == 2)
+        assert_problem(server.client.get(f"{place}/source.png"), 503, "overloaded", None)
+        assert_problem(server.client.post(f"{place}/inspect", json={}), 503, "overloaded", None)
+        assert_problem(server.client.post("/inspect", files=form_request()), 503, "overloaded", None)
+        asked += [pool.submit(server.post_form, form_request()) for _ in range(2)]
+        wait_until(lambda: gate.present == 4)
+        may_go.set()
+        assert [one.result(30).status_code for one in asked] == [200] * 4
+        wait_until(lambda: gate.present == 0)
+        assert server.client.get(f"{place}/source.png").status_code == 200
+
+
+def test_a_stream_that_is_deleted_during_a_call_does_not_come_back() -> None:
+    may_go, calls = threading.Event(), []  # type: ignore[var-annotated]
+    detector = RuleDetector(may_go=may_go, calls=calls)
+    with live_server(lambda settings: detector) as server, ThreadPoolExecutor(1) as pool, ExitStack() as ending:
+        ending.callback(may_go.set)
+        first, second, *_ = sample_calls()
+        assert server.client.post("/streams/drone7/frames", files=first).status_code == 200
+        at_work = pool.submit(server.client.post, "/streams/drone7/frames", files=second)
+        wait_until(lambda: len(calls) == 1)
+        assert server.client.delete("/streams/drone7").status_code == 204
+        may_go.set()
+        assert len(at_work.result(30).json()["detections"]) == 1
         assert server.client.get("/live").json()["streams"] == []
 
 
@@ -295,7 +403,7 @@ def test_a_detector_without_maps_still_shows_its_frames() -> None:
 )
 def test_without_memory_there_is_nothing_to_look_at(settings: dict[str, Any], code: str) -> None:
     with live_server(lambda settings: RuleDetector(), **settings) as server:
-        for path in ("/live", "/live/events", "/streams/a/live", "/streams/a/pairs", "/streams/a/pairs/1/source.png"):
+        for path in ("/live", "/live/pairs", "/streams/a/live", "/streams/a/pairs", "/streams/a/pairs/1/source.png"):
             assert_problem(server.client.get(path), 501, code, None)
         assert_problem(server.client.post("/inspect", files=form_request()), 501, code, None)
         if code == "live_off":
@@ -305,10 +413,49 @@ def test_without_memory_there_is_nothing_to_look_at(settings: dict[str, Any], co
 def test_followers_are_bounded() -> None:
     with live_server(lambda settings: RuleDetector()) as server:
         memory = server.app.state.core.live
-        memory._followers = MAX_FOLLOWERS
-        answer = server.client.get("/live/events")
-        assert_problem(answer, 503, "live_full", None)
-        assert "retry-after" in answer.headers
+        with ExitStack() as following:
+            clients = following.enter_context(
+                httpx.Client(base_url=server.client.base_url, timeout=60, trust_env=False)
+            )
+            for _ in range(MAX_FOLLOWERS):
+                answer = following.enter_context(clients.stream("GET", "/live/pairs"))
+                assert answer.status_code == 200
+            answer = server.client.get("/live/pairs")
+            assert_problem(answer, 503, "live_full", None)
+            assert "retry-after" in answer.headers
+        wait_until(lambda: memory.followers == 0)
+        with server.client.stream("GET", "/live/pairs") as answer:
+            assert answer.status_code == 200
+
+
+def test_a_place_is_free_at_once_when_sending_is_cancelled() -> None:
+    left: list[bool] = []
+
+    async def parts() -> AsyncGenerator[bytes, None]:
+        try:
+            yield b": one\n\n"
+        finally:
+            left.append(False)
+
+    async def cancelled_in_send() -> None:
+        sending = asyncio.Event()
+
+        async def receive() -> Any:
+            await asyncio.Event().wait()
+
+        async def send(message: Any) -> None:
+            if message["type"] == "http.response.body":
+                sending.set()
+                await asyncio.Event().wait()
+
+        response = LiveResponse(parts(), leave=lambda: left.append(True))
+        task = asyncio.ensure_future(response({"type": "http", "asgi": {}}, receive, send))
+        await sending.wait()
+        task.cancel()
+        await asyncio.wait({task})
+        assert left == [False, True]  # the generator ends first, nobody waits for garbage to be collected
+
+    asyncio.run(cancelled_in_send())
 
 
 def test_scopes(tmp_path: Path) -> None:
@@ -331,7 +478,7 @@ def test_scopes(tmp_path: Path) -> None:
         pair = f"/streams/drone7/pairs/{number}"
         for path in ("/live", "/streams/drone7/pairs", f"{pair}/source.png", "/detector"):
             assert [status("GET", path, scope) for scope in ("read", "detect", None)] == [200, 403, 401], path
-        for path in ("/live/events", "/streams/drone7/live"):
+        for path in ("/live/pairs", "/streams/drone7/live"):
             assert [status("GET", path, scope) for scope in ("detect", None)] == [403, 401], path
         for path in (f"{pair}/inspect", "/inspect"):
             assert [status("POST", path, scope) for scope in ("read", None)] == [403, 401], path

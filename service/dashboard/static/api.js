@@ -102,7 +102,7 @@ export async function follow({ onPair, onState, refresh }) {
   for (;;) {
     try {
       const after = await refresh();
-      const response = await ask(`/live/events?after=${after}`);
+      const response = await ask(`/live/pairs?after=${after}`);
       onState("live");
       wait = 500;
       await readEvents(response.body, onPair);
