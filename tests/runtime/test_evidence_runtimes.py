@@ -174,7 +174,7 @@ def test_a_head_of_other_cues_is_refused(tmp_path: Path) -> None:
 def test_a_network_is_no_head_and_a_missing_one_is_told(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError) as caught:
         load_evidence(bundled_checkpoint(), runtime="torch")
-    assert caught.value.code == "checkpoint_record_invalid"
+    assert caught.value.code == "checkpoint_of_other_kind"
     with pytest.raises(CheckpointError) as caught:
         load_evidence(tmp_path / "none.safetensors")
     assert caught.value.code == "checkpoint_missing"

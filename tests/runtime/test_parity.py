@@ -27,6 +27,7 @@ from viflow_anomaly.export_samples import head_samples
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.model_input import ModelInput, prepare
 from viflow_anomaly.moving_regions import sigmoid
+from viflow_anomaly.regions import BoundingBox
 from viflow_anomaly.runtime.export import export_head
 from viflow_anomaly.runtime.loading import load_evidence, load_runtime
 from viflow_anomaly.sensor_data import Frame, FramePair, ImuSamples
@@ -37,6 +38,8 @@ for package, extra in (("openvino", "openvino"), ("onnxruntime", "onnxruntime"),
 SAMPLE = Path(__file__).parents[2] / "samples" / "drone"
 OTHERS: list[RuntimeName] = [name for name in get_args(RuntimeName) if name not in ("auto", "torch")]
 MAX_FLOW_DIFFERENCE_PX = MAX_SCORE_DIFFERENCE = 1e-3
+MAX_SIDE_DIFFERENCE_PX = 1
+"""Where a pixel's probability lies on a threshold, sums in another order (another CPU) put it on the other side."""
 MAX_BFLOAT16_FLOW_PX = 0.02
 """In the mean over a pair's flow, of the network."""
 MAX_PROBABILITY_LOSS = {"bf16": 0.005, "int8": 0.02}
@@ -128,13 +131,38 @@ def test_the_flow_is_torchs(runtime: RuntimeName, name: str) -> None:
 def test_the_regions_are_torchs(runtime: RuntimeName, name: str) -> None:
     found = detector(runtime).detect(case(name))
     assert (found.status, found.model) == (expected(name).status, expected(name).model)
-    assert [(one.bbox, one.label) for one in found.rois] == [(one.bbox, one.label) for one in expected(name).rois]
+    assert [one.label for one in found.rois] == [one.label for one in expected(name).rois]
+    sides = (np.array([corners(one.bbox) for one in answer.rois]) for answer in (found, expected(name)))
+    np.testing.assert_allclose(*sides, rtol=0, atol=MAX_SIDE_DIFFERENCE_PX)
     for ours, theirs in zip(found.rois, expected(name).rois, strict=True):
         assert ours.score == pytest.approx(theirs.score, abs=MAX_SCORE_DIFFERENCE)
 
 
+@pytest.mark.parametrize("runtime", OTHERS)
+def test_nearly_all_boxes_are_torchs_to_the_pixel(runtime: RuntimeName) -> None:
+    pairs = [
+        (ours.bbox, theirs.bbox)
+        for name in CASES
+        for ours, theirs in zip(detector(runtime).detect(case(name)).rois, expected(name).rois, strict=True)
+    ]
+    assert sum(ours != theirs for ours, theirs in pairs) <= 1
+
+
+def corners(box: BoundingBox) -> tuple[int, int, int, int]:
+    return box.x, box.y, box.x + box.width, box.y + box.height
+
+
+def require_bfloat16(precision: Precision) -> None:
+    """Not every CPU computes in it; OpenVINO then refuses."""
+    import openvino  # noqa: PLC0415 - skipped above where it is not installed
+
+    if precision == "bf16" and "BF16" not in openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES"):
+        pytest.skip("this CPU does not compute in bfloat16")
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_bfloat16_flow_is_within_its_loss(name: str) -> None:
+    require_bfloat16("bf16")
     exact, rough = (
         load_runtime(None, runtime="openvino", precision=precision).runtime.predict(given(name)).flow_px
         for precision in PRECISIONS
@@ -163,6 +191,8 @@ def head(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_probabilities_are_within_the_loss_of_their_precision(
     head: Path, runtime: RuntimeName, precision: Precision, name: str
 ) -> None:
+    if runtime == "openvino":
+        require_bfloat16(precision)
     loaded = load_evidence(head, runtime=runtime, precision=precision).runtime
     assert loaded.backend == (runtime, "cpu", precision)
     exact = load_evidence(None, runtime="torch", precision="f32").runtime.judge(*cues(name))
