@@ -37,9 +37,13 @@ for package, extra in (("openvino", "openvino"), ("onnxruntime", "onnxruntime"),
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "drone"
 OTHERS: list[RuntimeName] = [name for name in get_args(RuntimeName) if name not in ("auto", "torch")]
-MAX_FLOW_DIFFERENCE_PX = MAX_SCORE_DIFFERENCE = 1e-3
-MAX_SIDE_DIFFERENCE_PX = 1
-"""Where a pixel's probability lies on a threshold, sums in another order (another CPU) put it on the other side."""
+MAX_FLOW_DIFFERENCE_PX = 1e-3
+MAX_SIDE_DIFFERENCE_PX, MAX_SCORE_DIFFERENCE = 2, 0.01
+MIN_SAME_SHARE = 0.85
+"""Of all regions, that are the same to the pixel, with scores as near as ``SAME_SCORE``. Sums in another order (another
+CPU) move the flow by a thousandth of a pixel; a gray level of the reconstruction may be rounded the other way for that,
+and inverse search on it end elsewhere in a few blocks."""
+SAME_SCORE = 1e-3
 MAX_BFLOAT16_FLOW_PX = 0.02
 """In the mean over a pair's flow, of the network."""
 MAX_PROBABILITY_LOSS = {"bf16": 0.005, "int8": 0.02}
@@ -139,13 +143,13 @@ def test_the_regions_are_torchs(runtime: RuntimeName, name: str) -> None:
 
 
 @pytest.mark.parametrize("runtime", OTHERS)
-def test_nearly_all_boxes_are_torchs_to_the_pixel(runtime: RuntimeName) -> None:
-    pairs = [
-        (ours.bbox, theirs.bbox)
+def test_nearly_all_regions_are_torchs_to_the_pixel(runtime: RuntimeName) -> None:
+    same = [
+        ours.bbox == theirs.bbox and abs(ours.score - theirs.score) <= SAME_SCORE
         for name in CASES
         for ours, theirs in zip(detector(runtime).detect(case(name)).rois, expected(name).rois, strict=True)
     ]
-    assert sum(ours != theirs for ours, theirs in pairs) <= 1
+    assert sum(same) >= MIN_SAME_SHARE * len(same)
 
 
 def corners(box: BoundingBox) -> tuple[int, int, int, int]:
