@@ -66,8 +66,12 @@ def _parts(own: BoolArray, motion: Float32Array, first: int) -> tuple[int, Label
     of each pixel, [h, w]; None where none does. What is below the level belongs to the nearest part."""
     pitch = max(1, round((own.size / SAMPLES) ** 0.5))
     some = (slice(None, None, pitch),) * 2
-    own, sampled = own[some], np.ascontiguousarray(motion[some])
+    own, sampled = np.ascontiguousarray(own[some]), np.ascontiguousarray(motion[some])
+    highest = cv2.minMaxLoc(sampled, own.view(np.uint8))[1]
     for number in range(first, len(LEVELS)):
+        needed = _probability_above(LEVELS[number])
+        if highest < needed:
+            break
         above = own & (sampled > np.float32(LEVELS[number]))
         count, labels, measured, _ = cv2.connectedComponentsWithStats(above.view(np.uint8), connectivity=4)
         if count < 3:
@@ -76,7 +80,6 @@ def _parts(own: BoolArray, motion: Float32Array, first: int) -> tuple[int, Label
         large = np.flatnonzero((areas * pitch**2 >= MIN_PART_PX) & (areas >= MIN_PART_SHARE * areas.sum())) + 1
         if len(large) < 2:
             continue
-        needed = _probability_above(LEVELS[number])
         kept = [int(one) for one in large if cv2.minMaxLoc(sampled, (labels == one).view(np.uint8))[1] >= needed]
         if len(kept) > 1:
             parts = _nearest(np.asarray(labels), kept).repeat(pitch, axis=0).repeat(pitch, axis=1)

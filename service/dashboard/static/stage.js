@@ -5,7 +5,7 @@ import { byId, h, onceAFrame } from "./dom.js";
 import { Frame, labelSwatch, regionsSvg } from "./picture.js";
 import { changed, currentDetection, currentPair, openRoi, state, subscribe } from "./state.js";
 import { isOpen } from "./tabs.js";
-import { ago, counted, moving, nameOfStream } from "./words.js";
+import { ago, counted, isQuiet, moving, nameOfStream } from "./words.js";
 
 let frame = null;
 let map = null;
@@ -53,8 +53,10 @@ function draw() {
 
 function noteOf(pair, detection) {
   const count = moving(detection).length;
-  const told = detection.status === "abstained" ? "this pair cannot be judged" : counted(count, "thing moves", "things move");
-  const parts = [h("strong", { class: count ? "hot" : "" }, told), ` · ${state.cursor === null ? "newest pair" : "held"}, ${ago(pair.received_at_ns)}`];
+  const quiet = isQuiet(pair.received_at_ns);
+  const words = quiet ? ["thing moved", "things moved"] : ["thing moves", "things move"];
+  const told = detection.status === "abstained" ? "this pair cannot be judged" : counted(count, ...words);
+  const parts = [h("strong", { class: count && !quiet ? "hot" : "" }, told), ` · ${state.cursor === null ? "newest pair" : "held"}, ${ago(pair.received_at_ns)}`];
   if (state.tuned?.number === pair.number) parts.push(h("span", { class: "chip" }, "as tuned"));
   for (const reason of detection.reasons) parts.push(h("span", { class: "chip warn", title: reason.message }, reason.code.replaceAll("_", " ")));
   return parts;

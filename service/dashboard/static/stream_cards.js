@@ -4,7 +4,7 @@ import { inWords, picture } from "./api.js";
 import { byId, h, onceAFrame } from "./dom.js";
 import { Frame, regionsSvg } from "./picture.js";
 import { select, state, subscribe } from "./state.js";
-import { ago, counted, moving, nameOfStream } from "./words.js";
+import { ago, counted, isQuiet, moving, nameOfStream } from "./words.js";
 
 const cards = new Map();
 
@@ -55,10 +55,11 @@ function updateCard(card, stream) {
   const active = Date.now() / 1000 - pair.received_at_ns / 1e9 < 3;
   card.status.textContent = active ? "live" : ago(pair.received_at_ns);
   card.status.dataset.active = active;
+  const quiet = isQuiet(pair.received_at_ns);
   const tracks = new Set(stream.pairs.flatMap((one) => moving(one.detection).map((roi) => roi.track_id)).filter((id) => id !== null)).size;
-  const told = detection.status === "abstained" ? "not judged" : (count ? `${count} moving` : "no motion");
+  const told = detection.status === "abstained" ? "not judged" : (count ? `${count} ${quiet ? "moved" : "moving"}` : "no motion");
   card.numbers.replaceChildren(
-    h("span", { class: count ? "hot" : "" }, told),
+    h("span", { class: count && !quiet ? "hot" : "" }, told),
     h("span", {}, `${counted(stream.overview?.judged_pairs ?? stream.pairs.length, "pair")}`),
     tracks ? h("span", {}, counted(tracks, "track")) : "",
   );

@@ -59,6 +59,9 @@ export function ago(ns) {
   return `${Math.round(seconds / 3600)} h ago`;
 }
 
+/** Whether a pair is too old to say what moves now. */
+export const isQuiet = (ns) => Date.now() / 1000 - ns / 1e9 > 30;
+
 export const moving = (detection) => detection.rois.filter((roi) => roi.label === "independent_motion");
 
 export function counted(count, one, many = `${one}s`) {
