@@ -18,16 +18,13 @@ class LiveResponse(StreamingResponse):
     Args:
         parts: the stream's bytes.
         leave: gives the place back.
-        headers: of the answer.
     """
 
-    def __init__(
-        self, parts: AsyncGenerator[bytes, None], *, leave: Callable[[], Any], headers: dict[str, str] | None = None
-    ) -> None:
+    def __init__(self, parts: AsyncGenerator[bytes, None], *, leave: Callable[[], Any]) -> None:
         self._parts = parts
         self._leave = leave
-        unheld = {"X-Accel-Buffering": "no"}  # nginx would hold events back until it has many
-        super().__init__(parts, media_type=SSE_MEDIA_TYPE, headers=unheld | (headers or {}))
+        headers = {"X-Accel-Buffering": "no"}  # nginx would hold events back until it has many
+        super().__init__(parts, media_type=SSE_MEDIA_TYPE, headers=headers)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:

@@ -8,6 +8,8 @@ so that noise on a plateau divides nothing.
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 
@@ -18,6 +20,9 @@ LEVELS = (0.6, 0.7, 0.8, 0.9, 0.95, 0.98)
 """Probabilities at which a component is looked at."""
 MIN_PERSISTENCE = 1.5
 """By how much the logit of a part's peak exceeds the level at which the part came off."""
+_ODDS = [level / (1 - level) * math.exp(MIN_PERSISTENCE) for level in LEVELS]
+NEEDED_PEAKS = tuple(odds / (1 + odds) for odds in _ODDS)
+"""The probability of such a peak, for each level."""
 MIN_PART_PX = 30
 MIN_PART_SHARE = 0.05
 """Of all that is above the level."""
@@ -69,7 +74,7 @@ def _parts(own: BoolArray, motion: Float32Array, first: int) -> tuple[int, Label
     own, sampled = np.ascontiguousarray(own[some]), np.ascontiguousarray(motion[some])
     highest = cv2.minMaxLoc(sampled, own.view(np.uint8))[1]
     for number in range(first, len(LEVELS)):
-        needed = _probability_above(LEVELS[number])
+        needed = NEEDED_PEAKS[number]
         if highest < needed:
             break
         above = own & (sampled > np.float32(LEVELS[number]))
@@ -85,11 +90,6 @@ def _parts(own: BoolArray, motion: Float32Array, first: int) -> tuple[int, Label
             parts = _nearest(np.asarray(labels), kept).repeat(pitch, axis=0).repeat(pitch, axis=1)
             return number, parts[: motion.shape[0], : motion.shape[1]]
     return len(LEVELS), None
-
-
-def _probability_above(level: float) -> float:
-    odds = level / (1 - level) * float(np.exp(MIN_PERSISTENCE))
-    return odds / (1 + odds)
 
 
 def _nearest(labels: LabelArray, kept: list[int]) -> LabelArray:

@@ -156,7 +156,7 @@ def _followed(core: ServiceCore, request: Request, stream_id: str | None) -> Res
     after = resume_after(request, memory.newest_number)
     memory.enter()
     events = pair_events(memory, core.gate, after=after, stream_id=stream_id)
-    return LiveResponse(events, leave=memory.leave, headers={"X-Accel-Buffering": "no"})
+    return LiveResponse(events, leave=memory.leave)
 
 
 async def _inspected(core: ServiceCore, body: RequestBody, remembered: RememberedPair) -> bytes:
