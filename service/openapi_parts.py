@@ -51,6 +51,12 @@ def parameter(name: str, schema: JsonObject, description: str, *, place: str = "
     return {"name": name, "in": place, "required": place == "path", "schema": schema, "description": description}
 
 
+def set_examples(paths: JsonObject, *examples: tuple[str, str, Any]) -> None:
+    """Whole ones, as (path, method, example of the answer 200): FastAPI leaves out of its own what is null."""
+    for path, method, example in examples:
+        paths[path][method]["responses"]["200"]["content"]["application/json"]["example"] = example
+
+
 def extend_openapi(app: FastAPI, change: Callable[[JsonObject], None]) -> None:
     """Let ``change`` work on the document once, when it is made.
 

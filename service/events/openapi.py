@@ -19,6 +19,7 @@ from viflow_anomaly_service.openapi_parts import (
     parameter,
     problems,
     reference,
+    set_examples,
 )
 from viflow_anomaly_service.store.openapi import (
     DETECTION_ID_SCHEMA,
@@ -197,12 +198,12 @@ def add_events_openapi(app: FastAPI) -> None:
             "DeliveryPage": DELIVERIES_SCHEMA,
         }
         paths = document["paths"]
-        for path, method, example in (
+        set_examples(
+            paths,
             ("/events", "get", EXAMPLE_EVENT_PAGE),
             ("/events/deliveries", "get", EXAMPLE_DELIVERIES),
             ("/events/deliveries/{delivery_id}/retry", "post", EXAMPLE_RETRY),
-        ):
-            paths[path][method]["responses"]["200"]["content"]["application/json"]["example"] = example
+        )
         (one,) = paths["/events/deliveries/{delivery_id}/retry"]["post"]["parameters"]
         one["schema"] = _DELIVERY_ID
 

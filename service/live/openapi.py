@@ -23,6 +23,7 @@ from viflow_anomaly_service.openapi_parts import (
     parameter,
     problems,
     reference,
+    set_examples,
 )
 
 _COUNT: Final[JsonObject] = {"type": "integer", "minimum": 0}
@@ -252,12 +253,12 @@ def add_live_openapi(app: FastAPI) -> None:
             "DetectorDescription": DETECTOR_SCHEMA,
         }
         paths = document["paths"]
-        for path, method, example in (
+        set_examples(
+            paths,
             ("/streams/{stream_id}/pairs/{number}/inspect", "post", EXAMPLE_TUNED),
             ("/inspect", "post", EXAMPLE_INSPECTED),
             ("/detector", "get", EXAMPLE_DETECTOR),
-        ):
-            paths[path][method]["responses"]["200"]["content"]["application/json"]["example"] = example
+        )
         for one in paths["/streams/{stream_id}/pairs/{number}/{picture}"]["get"]["parameters"]:
             if one["name"] == "picture":
                 one["schema"] = {"enum": [f"{name}.{suffix}" for name in PICTURES for suffix in ("png", "jpg")]}

@@ -18,6 +18,7 @@ from viflow_anomaly_service.openapi_parts import (
     parameter,
     problems,
     reference,
+    set_examples,
 )
 from viflow_anomaly_service.store.query import DEFAULT_LIMIT, DETECTION_ID, LABELS, MAX_CURSOR, MAX_LIMIT, ORDERS
 from viflow_anomaly_service.store.query import STREAM_ID as STREAM_ID_PATTERN
@@ -127,8 +128,11 @@ def add_store_openapi(app: FastAPI) -> None:
     def change(document: JsonObject) -> None:
         document["components"]["schemas"] |= {"StoredDetection": STORED_SCHEMA, "DetectionPage": PAGE_SCHEMA}
         paths = document["paths"]
-        for path, example in (("/detections", EXAMPLE_PAGE), ("/detections/{detection_id}", EXAMPLE_STORED)):
-            paths[path]["get"]["responses"]["200"]["content"]["application/json"]["example"] = example
+        set_examples(
+            paths,
+            ("/detections", "get", EXAMPLE_PAGE),
+            ("/detections/{detection_id}", "get", EXAMPLE_STORED),
+        )
         for path in ("/detections/{detection_id}", "/detections/{detection_id}/thumbnail"):
             (one,) = paths[path]["get"]["parameters"]
             one["schema"] = DETECTION_ID_SCHEMA

@@ -27,6 +27,7 @@ from viflow_anomaly_service.openapi_parts import (
     extend_openapi,
     problems,
     reference,
+    set_examples,
 )
 from viflow_anomaly_service.store.openapi import DETECTION_ID_SCHEMA, EXAMPLE_ID, STREAM_ID
 from viflow_anomaly_service.streams.schemas import StampedStreamSamples, StreamRequest, StreamSetup
@@ -193,12 +194,12 @@ def add_streams_openapi(app: FastAPI) -> None:
             "StreamList": LIST_SCHEMA,
         }
         paths = document["paths"]
-        for path, method, example in (
+        set_examples(
+            paths,
             ("/streams", "get", {"streams": [EXAMPLE_STATUS]}),
             ("/streams/{stream_id}", "get", EXAMPLE_STATUS),
             ("/streams/{stream_id}/frames", "post", EXAMPLE_ANSWER),
-        ):
-            paths[path][method]["responses"]["200"]["content"]["application/json"]["example"] = example
+        )
         for path in ("/streams/{stream_id}", "/streams/{stream_id}/frames"):
             for operation in paths[path].values():
                 (name,) = operation["parameters"]
