@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from viflow_anomaly.checkpoint import load_evidence_head
 from viflow_anomaly.checkpoint_record import EvidenceRecord, read_tensors
 from viflow_anomaly.cli.train_evidence import recordings_in
-from viflow_anomaly.config import EvidenceTrainingConfig
+from viflow_anomaly.config import EvidenceHeadConfig, EvidenceTrainingConfig
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import CheckpointError, ConfigError, DatasetError
 from viflow_anomaly.evidence_cues import GEOMETRIC_CUES
@@ -154,6 +154,25 @@ def test_a_killed_run_goes_on_to_the_same_weights(tmp_path: Path, detector: Anom
     record = load_evidence_head(whole).record
     assert record.provenance["model"]["sha256"] == detector.model_info.sha256
     assert len(record.region_score.weights) == len(REGION_FEATURES)
+
+
+def test_a_training_goes_on_from_a_heads_weights(tmp_path: Path, detector: AnomalyDetector) -> None:
+    data, calibration = [recording(tmp_path / "drone_1")], [recording(tmp_path / "drone_2")]
+    still = SMALL.model_copy(update={"steps": 1, "learning_rate": 1e-12, "weight_decay": 0.0})
+    settings = {"calibration": calibration, "detector": easily_moved(detector)}
+    first = train_evidence(data, tmp_path / "first", training=SMALL, **settings)  # type: ignore[arg-type]
+    second = train_evidence(data, tmp_path / "second", training=still, init=first, **settings)  # type: ignore[arg-type]
+    before, after = load_evidence_head(first), load_evidence_head(second)
+    for name, weights in before.head.state_dict().items():
+        torch.testing.assert_close(after.head.state_dict()[name], weights, rtol=0, atol=1e-9)
+    assert after.record.provenance["init"]["sha256"] == before.record.sha256
+    with pytest.raises(ConfigError) as caught:
+        train_evidence(data, tmp_path / "second", training=still, resume=True, **settings)  # type: ignore[arg-type]
+    assert (caught.value.code, caught.value.field) == ("resume_config_differs", "init")
+    wider = still.model_copy(update={"head": EvidenceHeadConfig(widths=(8, 8, 8, 16))})
+    with pytest.raises(ConfigError) as caught:
+        train_evidence(data, tmp_path / "third", training=wider, init=first, **settings)  # type: ignore[arg-type]
+    assert (caught.value.code, caught.value.field) == ("init_model_differs", "evidence_training.head.widths")
 
 
 def easily_moved(detector: AnomalyDetector) -> AnomalyDetector:

@@ -239,8 +239,8 @@ class RegionConfig(FrozenConfig):
     shape_rule: ShapeRuleName = Field(
         default="axis_aligned", description="what tells motion from narrow bands; axis_aligned: the paper's"
     )
-    min_x_extent_fraction: float = Field(default=0.018, ge=0, le=1, description="of the diagonal: narrower is a band")
-    min_y_extent_fraction: float = Field(default=0.018, ge=0, le=1, description="of the diagonal: narrower is a band")
+    min_x_extent_fraction: float = Field(default=0.008, ge=0, le=1, description="of the diagonal: narrower is a band")
+    min_y_extent_fraction: float = Field(default=0.008, ge=0, le=1, description="of the diagonal: narrower is a band")
     max_aspect_ratio: float = Field(default=5.0, ge=1, description="a longer bounding box is a band")
     motion_score: float = Field(
         default=0.5, ge=0.5, le=1.01, description="independent_motion scores at least this; above 1: nothing does"

@@ -25,6 +25,7 @@ from viflow_anomaly.evidence_training import EvidenceTraining, Fingerprint
 from viflow_anomaly.region_score_fit import fit_region_score, labelled_regions
 from viflow_anomaly.runtime.loading import LoadedEvidence
 from viflow_anomaly.runtime.torch_evidence import TorchEvidence
+from viflow_anomaly.training_init import origin_of, read_initial_head
 
 LOG_EVERY = 100
 Report = Callable[[str, int, int], None]
@@ -38,6 +39,7 @@ def train_evidence(
     calibration: Sequence[Path],
     detector: AnomalyDetector,
     training: EvidenceTrainingConfig,
+    init: Path | None = None,
     device: str = "cpu",
     resume: bool = False,
     report: Report = lambda what, done, total: None,
@@ -51,6 +53,7 @@ def train_evidence(
         calibration: recordings to fit the scores on, never to train on.
         detector: whose network's flow the head is to judge; its cues are learned from.
         training: structure and steps.
+        init: a head to start from, instead of fresh weights; the structure is its own.
         resume: go on from ``out_dir``; a fresh directory starts anew.
 
     Returns:
@@ -58,11 +61,15 @@ def train_evidence(
 
     Raises:
         ConfigError: ``training_exists``, ``output_unusable``, ``resume_config_differs``, ``device_unavailable``,
-            ``training_diverged``; ``calibration_trained_on`` where a recording is in both lists.
+            ``training_diverged``, ``init_model_differs``; ``calibration_trained_on`` where a recording is in both
+            lists.
         DatasetError: as ``load_examples`` and ``labelled_regions``.
-        CheckpointError: ``checkpoint_corrupt`` for the state to go on from.
+        CheckpointError: ``checkpoint_corrupt`` for the state to go on from; as ``load_evidence_head`` for ``init``.
     """
     require_device(device)
+    initial = None if init is None else read_initial_head(init, training.head)
+    if initial is not None:
+        training = training.model_copy(update={"head": initial.record.head})
     data, calibration = (sorted(some, key=lambda path: (path.name, path)) for some in (data, calibration))
     _require_apart(data, calibration)
     for path in calibration:
@@ -72,9 +79,12 @@ def train_evidence(
     fingerprint: Fingerprint = {
         "model": detector.model_info.sha256,
         "evidence_training": training.model_dump(mode="json", exclude={"checkpoint_every"}),
+        "init": None if initial is None else initial.record.sha256,
         "data": [path.name for path in data],
     }
     run = EvidenceTraining(training, device=device)
+    if initial is not None:
+        run.network.load_state_dict(initial.head.state_dict())
     run.restore(out_dir, fingerprint)
     if run.step < training.steps:
         examples = load_examples(
@@ -87,6 +97,8 @@ def train_evidence(
         )
         _run_steps(run, EvidenceData(examples, training), out_dir, fingerprint, report)
     record = _record(training, detector.model_info, data, calibration)
+    if initial is not None:
+        record = _with_provenance(record, init=origin_of(initial.record))
     head = LoadedEvidenceHead(run.network.eval(), record)
     return _with_scores(head, out_dir / "evidence.safetensors", detector, calibration, report, device=device)
 
@@ -120,8 +132,7 @@ def refit_scores(
         )
     _require_some("calibration", calibration)
     loaded = load_evidence_head(head)
-    provenance = {**loaded.record.provenance, "scores_commit": source_commit(), "calibration": _told(calibration)}
-    record = loaded.record.model_copy(update={"provenance": provenance})
+    record = _with_provenance(loaded.record, scores_commit=source_commit(), calibration=_told(calibration))
     return _with_scores(loaded._replace(record=record), out, detector, calibration, report)
 
 
@@ -163,6 +174,10 @@ def _record(
             "calibration": _told(calibration),
         },
     )
+
+
+def _with_provenance(record: EvidenceRecord, **told: Any) -> EvidenceRecord:
+    return record.model_copy(update={"provenance": {**record.provenance, **told}})
 
 
 def _told(recordings: Sequence[Path]) -> dict[str, Any]:

@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 
 import torch
 
-from viflow_anomaly.checkpoint import load_checkpoint
-from viflow_anomaly.config import FrozenConfig, ModelConfig
+from viflow_anomaly.checkpoint import LoadedEvidenceHead, load_checkpoint, load_evidence_head
+from viflow_anomaly.checkpoint_record import CheckpointRecord, EvidenceRecord
+from viflow_anomaly.config import EvidenceHeadConfig, FrozenConfig, ModelConfig
 from viflow_anomaly.errors import ConfigError
 
 
@@ -39,16 +40,31 @@ def read_initial_weights(path: Path, asked: ModelConfig) -> InitialWeights:
         ConfigError: ``init_model_differs``: a setting of ``asked`` is not the checkpoint's.
     """
     network, record = load_checkpoint(path)
-    differing = list(_differing("model", asked, record.model))
+    _require_same(path, "model", asked, record.model)
+    return InitialWeights(network.state_dict(), record.model, origin_of(record))
+
+
+def read_initial_head(path: Path, asked: EvidenceHeadConfig) -> LoadedEvidenceHead:
+    """The evidence head to start from, also one of an older cues' arithmetic; arguments and errors as above."""
+    loaded = load_evidence_head(path)
+    _require_same(path, "evidence_training.head", asked, loaded.record.head)
+    return loaded
+
+
+def origin_of(record: CheckpointRecord | EvidenceRecord) -> dict[str, Any]:
+    """What the provenance of a training tells of the checkpoint that it began with."""
+    return {"name": record.name, "version": record.version, "sha256": record.sha256}
+
+
+def _require_same(path: Path, name: str, asked: FrozenConfig, has: FrozenConfig) -> None:
+    differing = list(_differing(name, asked, has))
     if differing:
         raise ConfigError(
-            f"{path}: with --init expected the checkpoint's own model settings, or none, found "
-            + "; ".join(f"{key}: {asked_for!r}, but the checkpoint has {has!r}" for key, asked_for, has in differing),
+            f"{path}: with --init expected the checkpoint's own settings of {name}, or none, found "
+            + "; ".join(f"{key}: {wanted!r}, but the checkpoint has {found!r}" for key, wanted, found in differing),
             code="init_model_differs",
             field=differing[0][0],
         )
-    origin = {"name": record.name, "version": record.version, "sha256": record.sha256}
-    return InitialWeights(network.state_dict(), record.model, origin)
 
 
 def _differing(name: str, asked: FrozenConfig, has: FrozenConfig) -> Iterator[tuple[str, object, object]]:

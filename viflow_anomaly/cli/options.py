@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from viflow_anomaly.detector import AnomalyDetector
     from viflow_anomaly.settings import Settings
 
+BUNDLED = Path("default")
+"""What ``--init`` calls the weights that come with the package."""
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", metavar="FILE", help="TOML or JSON file of settings (see `config`).")
 ]

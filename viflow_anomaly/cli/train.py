@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from viflow_anomaly.cli.options import (
+    BUNDLED,
     Assignments,
     ConfigFile,
     Device,
@@ -20,7 +21,6 @@ from viflow_anomaly.cli.options import (
 )
 from viflow_anomaly.config import FINE_TUNING_DEFAULTS
 
-BUNDLED = Path("default")
 FINE_TUNING = ", ".join(f"{key}={value:g}" for key, value in FINE_TUNING_DEFAULTS.items())
 
 

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from viflow_anomaly.cli.options import (
+    BUNDLED,
     Assignments,
     Checkpoint,
     ConfigFile,
@@ -32,6 +33,10 @@ def train_evidence(
         list[Path],
         typer.Option(metavar="DIR", help="A folder of recordings to fit the scores on, never to train on. Repeatable."),
     ],
+    init: Annotated[
+        Path | None,
+        typer.Option(metavar="default|PATH", help="Start from a head's weights (default: the bundled one's)."),
+    ] = None,
     steps: Steps = None,
     seed: Seed = None,
     resume: Resume = False,
@@ -63,6 +68,7 @@ def train_evidence(
     settings = settings_from(config, assignments, options)
     # There is no head yet, and the one that comes judges every pair.
     settings = settings.model_copy(update={"detector": settings.detector.model_copy(update={"evidence": "auto"})})
+    from viflow_anomaly.checkpoint_record import bundled_evidence_head
     from viflow_anomaly.evidence_run import train_evidence as train_head
 
     folders = [path for folder in calibration for path in recordings_in(folder)]
@@ -74,6 +80,7 @@ def train_evidence(
             calibration=folders,
             detector=load_detector(settings, evidence=False),
             training=settings.evidence_training,
+            init=bundled_evidence_head() if init == BUNDLED else init,
             device=settings.device,
             resume=resume,
             report=lambda what, done, total: progress.update(task, description=what, completed=done, total=total),
