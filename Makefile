@@ -139,7 +139,10 @@ head: held-out
 	simulate drone 35900 10 6 head-calibration --set simulator.width=752 --set simulator.height=480; \
 	simulate car 85800 16 8 head-calibration --set simulator.foliage=50; \
 	simulate car 85900 12 6 head-calibration --set simulator.width=832 --set simulator.height=256 \
-	  --set simulator.foliage=50
+	  --set simulator.foliage=50; \
+	simulate car 87000 12 6 head-calibration --set simulator.width=1242 --set simulator.height=375 \
+	  --set simulator.foliage=60; \
+	simulate car 87100 12 6 head-calibration --set simulator.width=1242 --set simulator.height=375
 	$(BIN)/viflow-anomaly train-evidence $(MODEL_DIR)/head/* --calibration $(MODEL_DIR)/head-calibration \
 	  --out $(MODEL_DIR)/head-run --resume --steps $(HEAD_STEPS) --threads $(HEAD_THREADS)
 	$(BIN)/viflow-anomaly export --evidence-head $(MODEL_DIR)/head-run/evidence.safetensors
