@@ -17,6 +17,7 @@ from pydantic import (
     PositiveFloat,
     PositiveInt,
     ValidationError,
+    field_validator,
     model_validator,
 )
 
@@ -317,6 +318,9 @@ class QualityConfig(FrozenConfig):
     )
 
 
+MIN_INTERNAL_SIDE_PX, MAX_INTERNAL_SIDE_PX = 64, 16384
+
+
 class DetectorConfig(FrozenConfig):
     """Everything a detection depends on besides the weights and the pair."""
 
@@ -324,6 +328,11 @@ class DetectorConfig(FrozenConfig):
     correction: CorrectionConfig = CorrectionConfig()
     quality: QualityConfig = QualityConfig()
     include_masks: bool = False
+    internal_short_side_px: int = Field(
+        default=240,
+        description="a picture whose shorter side is over 1.25 times this is judged at this size, where the evidence "
+        "head judges; 0: at its own",
+    )
     evidence: Literal["auto", "learned", "residual"] = Field(
         default="auto",
         description="what regions are found in: what the evidence head makes of the reconstruction, or the residual "
@@ -338,6 +347,15 @@ class DetectorConfig(FrozenConfig):
     min_texture_gray: float = Field(default=2.0, ge=0, description="standard deviation below which nothing is judged")
     min_overlap: float = Field(default=0.05, ge=0, le=1, description="share of the analysed pixels still in the target")
     max_exposure_jump_gray: float = Field(default=20.0, ge=0, description="change of the mean between the frames")
+
+    @field_validator("internal_short_side_px")
+    @classmethod
+    def _no_size_or_one_that_shows_something(cls, short_side_px: int) -> int:
+        if short_side_px and not MIN_INTERNAL_SIDE_PX <= short_side_px <= MAX_INTERNAL_SIDE_PX:
+            raise ValueError(
+                f"expected 0 or {MIN_INTERNAL_SIDE_PX} to {MAX_INTERNAL_SIDE_PX} pixels, found {short_side_px}"
+            )
+        return short_side_px
 
 
 EVIDENCE_BLOCK_PX = 4

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from viflow_anomaly.alignment import Alignment, align, remaining_evidence
+from viflow_anomaly.analysis import Analysis
 from viflow_anomaly.checkpoint_record import CheckpointRecord
 from viflow_anomaly.config import DetectorConfig, MotorSource, Precision, RuntimeName
 from viflow_anomaly.detection import (
@@ -25,13 +26,15 @@ from viflow_anomaly.detection import (
 from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.evidence_cues import EvidenceCues, evidence_cues
 from viflow_anomaly.explanation import Explanation, explain
-from viflow_anomaly.geometry import Float32Array, pixel_grid
-from viflow_anomaly.model_input import ModelInput, prepare
+from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.internal_size import InternalSize, internal_size
+from viflow_anomaly.model_input import prepare
 from viflow_anomaly.motion_evidence import JudgedCues, judge_cues, regions_of, require_our_cues, takes_head
 from viflow_anomaly.motion_input import MotionWindow
 from viflow_anomaly.pair_detector import Execution, LoadedWeights
 from viflow_anomaly.pair_quality import Finding, judge_correction, judge_images, judge_window
 from viflow_anomaly.prediction import PredictedFlow, predict_flow
+from viflow_anomaly.regions import BoundingBox
 from viflow_anomaly.runtime.interface import Runtime
 from viflow_anomaly.runtime.loading import LoadedEvidence, load_evidence, load_runtime
 from viflow_anomaly.sensor_data import FramePair
@@ -54,38 +57,6 @@ HEAD_NOT_FINITE = Reason(
     code="prediction_not_finite",
     message="expected finite numbers from the evidence head, found others: its weights are damaged",
 )
-
-
-class Analysis(NamedTuple):
-    """A detection with the maps it was made from, for pictures and further processing.
-
-    Attributes:
-        detection: what ``detect`` returns.
-        residual: [H, W] float32 photometric residual in gray levels at the source image's size.
-        evidence: [H, W] float32 what regions are found in: probabilities of motion 0..1 (learned evidence), or the
-            residual, normalised by texture. The head does not look at a pair that is not judged: probabilities are 0.
-        inside: [H, W] analysed pixels that are still in the target image; elsewhere nothing is found.
-        reconstruction: [H, W] float32 source image rebuilt from the target.
-        target_coordinates: [H, W, 2] float32 where each source pixel is predicted in the target image.
-        predicted: the flow they come from, in the network's view, and its correction.
-        learned: this is a pair for the evidence head, so that ``evidence`` are probabilities.
-        model_input: how the network saw the pair.
-    """
-
-    detection: Detection
-    residual: Float32Array
-    evidence: Float32Array
-    inside: NDArray[np.bool_]
-    reconstruction: Float32Array
-    target_coordinates: Float32Array
-    predicted: PredictedFlow
-    learned: bool
-    model_input: ModelInput
-
-    @property
-    def flow_px(self) -> Float32Array:
-        """[H, W, 2] float32 flow of the static world in source pixels."""
-        return self.target_coordinates - pixel_grid(*self.residual.shape)
 
 
 class AnomalyDetector:
@@ -224,7 +195,8 @@ class AnomalyDetector:
     def analyze(self, pair: FramePair, *, decode_ms: float = 0.0) -> Analysis:
         """``detect`` with its maps; same errors. The paper's algorithm on one screen."""
         started = time.perf_counter()
-        explained, alignment = self._explain(pair)
+        size = self.internal_size(pair)
+        explained, alignment = self._explain(pair if size is None else size.reduce(pair))
         summary = self._summary(explained)
         findings = self._findings(pair, explained, shares_scene=summary is not None)
         abstained = any(finding.abstain for finding in findings)
@@ -232,15 +204,9 @@ class AnomalyDetector:
         if judged is not None and not judged.maps.finite:
             findings, abstained = (*findings, Finding(HEAD_NOT_FINITE, abstain=True)), True
         inferred = time.perf_counter()
-        residual = explained.residual
-        height, width = residual.shape
+        height, width = pair.source.image.shape
         image = ImageSize(width=width, height=height)
-        rois: tuple[Roi, ...] = ()
-        if not abstained:
-            regions = regions_of(explained, judged, self._evidence, self.config)
-            rois = rois_from_regions(
-                regions, image, include_masks=self.config.include_masks, target_coordinates=explained.target_coordinates
-            )
+        rois = () if abstained else self._rois(explained, judged, image, size)
         finished = time.perf_counter()
         timings_ms = {
             "decode": decode_ms,
@@ -248,7 +214,8 @@ class AnomalyDetector:
             "regions": (finished - inferred) * 1e3,
             "total": decode_ms + (finished - started) * 1e3,
         }
-        x, y, region_width, region_height = explained.model_input.view.region()
+        analyzed = BoundingBox(*explained.model_input.view.region())
+        analyzed = analyzed if size is None else size.box(analyzed)
         detection = Detection(
             source_timestamp_ns=pair.source.timestamp_ns,
             target_timestamp_ns=pair.target.timestamp_ns,
@@ -257,15 +224,34 @@ class AnomalyDetector:
             reasons=tuple(finding.reason for finding in findings),
             model=self.model_info,
             rois=rois,
-            region_analyzed=AnalyzedRegion(x=x, y=y, width=region_width, height=region_height),
+            region_analyzed=AnalyzedRegion(**analyzed._asdict()),
             residual=summary,
             timings_ms=timings_ms,
         )
         learned = alignment is not None
-        nothing = np.zeros_like(residual) if learned else explained.normalised
-        evidence = nothing if judged is None else judged.maps.motion
-        maps = (residual, evidence, explained.inside, explained.reconstruction, explained.target_coordinates)
-        return Analysis(detection, *maps, explained.predicted, learned=learned, model_input=explained.model_input)
+        nothing = np.zeros_like(explained.residual) if learned else explained.normalised
+        found_in = nothing if judged is None else judged.maps.motion
+        return Analysis(detection, explained, found_in, learned, size)
+
+    def internal_size(self, pair: FramePair) -> InternalSize | None:
+        """At what size the pair is judged; None: its own, always where no evidence head takes part."""
+        config, model = self.config, self._record.model
+        knows_depth = model.preset == "calibrated" and config.correction.enabled
+        takes_part = config.evidence == "learned" or (config.evidence == "auto" and knows_depth)
+        if self._evidence is None or not takes_part or model.view.mode == "center_crop":
+            return None
+        height, width = pair.source.image.shape
+        return internal_size(width, height, config.internal_short_side_px)
+
+    def _rois(
+        self, explained: Explanation, judged: JudgedCues | None, image: ImageSize, size: InternalSize | None
+    ) -> tuple[Roi, ...]:
+        """In source pixels."""
+        regions, coordinates = regions_of(explained, judged, self._evidence, self.config), explained.target_coordinates
+        if size is not None and regions:
+            regions, coordinates = [size.region(region) for region in regions], size.coordinates(coordinates)
+        masks = self.config.include_masks
+        return rois_from_regions(regions, image, include_masks=masks, target_coordinates=coordinates)
 
     def _findings(self, pair: FramePair, explained: Explanation, *, shares_scene: bool) -> tuple[Finding, ...]:
         """What can be said against the pair, and whether it can be judged at all."""
@@ -284,17 +270,23 @@ class AnomalyDetector:
         return _summary(explained.residual, explained.inside, self.config.min_overlap, width * height)
 
     def judge_cues(self, pair: FramePair) -> tuple[JudgedCues, NDArray[np.bool_]] | None:
-        """What the head says of a pair, and which pixels [H, W] are inside; None where regions come from the residual.
+        """What the head says of a pair, and which pixels are inside; None where regions come from the residual.
+
+        Maps are of the pair's ``internal_size``.
 
         Raises:
             InvalidInputError: as ``detect``.
         """
-        explained, alignment = self._explain(pair)
+        size = self.internal_size(pair)
+        explained, alignment = self._explain(pair if size is None else size.reduce(pair))
         judged = self._judge(explained, alignment)
         return None if judged is None else (judged, explained.inside)
 
     def cues(self, pair: FramePair) -> tuple[EvidenceCues, NDArray[np.bool_]]:
-        """What the evidence head is shown of a pair, and which pixels [H, W] are inside; errors as ``detect``."""
+        """What an evidence head learns from: the cues of a pair at its own size, and which pixels [H, W] are inside.
+
+        Errors as ``detect``.
+        """
         explained, alignment = self._explain(pair, for_head=True)
         assert alignment is not None
         return evidence_cues(remaining_evidence(explained, alignment)), explained.inside

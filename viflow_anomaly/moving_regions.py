@@ -64,6 +64,10 @@ CUE_FEATURES = REGION_FEATURES[6:]
 _CUES = [GEOMETRIC_CUES.index(name) for name in CUE_FEATURES]
 
 
+LENGTHS = ("across_epipolar_px", "along_epipolar_px", "parallax_px")
+"""What a region's evidence tells in pixels of the judged picture."""
+
+
 class MotionMaps(NamedTuple):
     """What the head says: [H, W] probability of motion and logit of a seam of every source pixel, and offsets
     [2, h, w] of the padded image's blocks to the middle of the thing they belong to, in blocks (y, x)."""
@@ -244,9 +248,7 @@ def _evidence(features: Float64Array, shape: Shape, ratio: float, config: Region
         "min_probability": needed,
         "fill_ratio": float(features[3]),
         "aspect_ratio": max(ratio, 1 / ratio),
-        "across_epipolar_px": across,
-        "along_epipolar_px": along,
-        "parallax_px": parallax,
+        **dict(zip(LENGTHS, (across, along, parallax), strict=True)),
     }
 
 

@@ -55,7 +55,8 @@ def labelled_regions(
         pairs = SimulatedPairs(path)
         for index in range(len(pairs)):
             try:
-                answer = detector.judge_cues(pairs.pair(index))
+                pair = pairs.pair(index)
+                answer = detector.judge_cues(pair)
             except InvalidInputError:
                 continue
             if answer is None:
@@ -64,7 +65,9 @@ def labelled_regions(
             found = measure_regions(judged.maps, judged.cues, inside, detector.config.regions)
             measured = [one for one in found if one.shape.passes]  # a band scores by the shape rule, not by this fit
             measured.sort(key=lambda one: -one.features[0])  # of two on one mover the likelier one finds it
-            boxes = [ScoredBox(one.box, float(one.features[0]), True) for one in measured]
+            size = detector.internal_size(pair)
+            found_at = [one.box if size is None else size.box(one.box) for one in measured]
+            boxes = [ScoredBox(box, float(one.features[0]), True) for box, one in zip(found_at, measured, strict=True)]
             for one, hit in zip(measured, DetectionScores.hits(boxes, pairs.labels(index)), strict=True):
                 if hit is not None:
                     features.append(one.features)
