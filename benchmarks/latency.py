@@ -109,15 +109,18 @@ class Stages:
     def __init__(self, checkpoint: Path | None, detector: AnomalyDetector, runtime: RuntimeName) -> None:
         self._runtime, self._record = load_runtime(checkpoint, runtime=runtime, threads=1)
         self._head = load_evidence(None, runtime=runtime, threads=1)
-        self._config = detector.config
+        self._detector, self._config = detector, detector.config
 
     def run(self, pair: FramePair) -> list[float]:
-        """Milliseconds of ``STAGES``; view is both images and the IMU window."""
+        """Milliseconds of ``STAGES``; view is both images, at their internal size, and the IMU window."""
         clock = [time.perf_counter()]
 
         def lap() -> None:
             clock.append(time.perf_counter())
 
+        size = self._detector.internal_size(pair)
+        image = ImageSize(*pair.source.image.shape[::-1])
+        pair = pair if size is None else size.reduce(pair)
         model_input = prepare(pair, self._record.model)
         lap()
         hypotheses = self._runtime.predict(model_input)
@@ -135,10 +138,10 @@ class Stages:
         lap()
         judged = None if cues is None else judge_cues(self._head, cues, explained)
         lap()
-        height, width = explained.source.shape
-        rois_from_regions(
-            regions_of(explained, judged, self._head, self._config), ImageSize(width=width, height=height)
-        )
+        regions, coordinates = regions_of(explained, judged, self._head, self._config), explained.target_coordinates
+        if size is not None and regions:
+            regions, coordinates = [size.region(region) for region in regions], size.coordinates(coordinates)
+        rois_from_regions(regions, image, target_coordinates=coordinates)
         lap()
         return [(after - before) * 1e3 for before, after in pairwise(clock)]
 
