@@ -7,6 +7,7 @@ is fitted (``RegionScore``), so that of regions scored 0.8 about 80 % move by th
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import cv2
@@ -166,24 +167,20 @@ def _things(maps: MotionMaps, mask: BoolArray, part: tuple[slice, slice], config
     A faint thing is what reaches ``faint_motion_probability`` and has no more than a speck that is certain; small and
     slow things are no more than that. It is neither cut along seams nor divided.
     """
-    from skimage.measure import label as label_components  # noqa: PLC0415  # a fifth of a second of start-up
-
     certain = mask & (maps.motion[part] > config.min_motion_probability)
     origin = (part[0].start, part[1].start)
     things = things_of_pixels(_labels(certain, maps.seam_logit[part]), maps.offsets, origin)
-    faint = label_components(mask, connectivity=2)  # type: ignore[no-untyped-call]
-    is_new = np.bincount(faint[certain], minlength=int(faint.max()) + 1) < config.min_area_fraction * maps.motion.size
+    count, faint = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)
+    is_new = np.bincount(faint[certain], minlength=count) < config.min_area_fraction * maps.motion.size
     is_new[0] = False
     things = divided_at_valleys(things, maps.motion[part])
-    return np.where(is_new[faint], faint + things.max(), things)
+    return np.where(is_new[faint], faint + things.max(), things) if is_new.any() else things
 
 
 def _labels(mask: BoolArray, seam_logit: Float32Array) -> LabelArray:
     """[H, W] components (1..) of the mask, cut along seams; what is left of a seam joins no component."""
-    from skimage.measure import label as label_components  # noqa: PLC0415  # a fifth of a second of start-up
-
     cut = mask & (seam_logit > SEAM_LOGIT)
-    labels, count = label_components(mask & ~cut, connectivity=2, return_num=True)  # type: ignore[no-untyped-call]
+    count, labels = cv2.connectedComponents((mask & ~cut).view(np.uint8), connectivity=8)
     left, top, width, height = cv2.boundingRect(cut.view(np.uint8))
     if not width or count > np.iinfo(np.uint16).max:
         return np.asarray(labels)
@@ -202,15 +199,15 @@ def _features(
     """[13], in the order of ``REGION_FEATURES``."""
     y, x = component
     some = slice(None, None, max(1, y.size // FEATURE_SAMPLES))
-    at, blocks = (y[some], x[some]), (y[some] // EVIDENCE_BLOCK_PX, x[some] // EVIDENCE_BLOCK_PX)
-    means = np.abs(cues.geometric[_CUES, blocks[0][:, None], blocks[1][:, None]]).mean(axis=0)
-    shares = (np.log(y.size / maps.motion.size), y.size / outline.size, min(shape.nearness_to_band, 2.0))
-    mean, (_, largest, _, _) = (
-        float(maps.motion[at].mean()),
-        cv2.minMaxLoc(maps.motion[box.pixels], outline.view(np.uint8)),
-    )
-    own = (_logit(mean), _logit(largest), *shares, sigmoid(maps.seam_logit[at]).mean())
-    return np.array([*own, *means], dtype=np.float64)
+    at, width = (y[some], x[some]), cues.geometric.shape[2]
+    blocks = at[0] // EVIDENCE_BLOCK_PX * width + at[1] // EVIDENCE_BLOCK_PX
+    bounded = cues.geometric.reshape(len(cues.geometric), -1).take(blocks, axis=1)[_CUES]
+    means = np.abs(bounded, out=bounded).sum(axis=1) / np.float32(blocks.size)
+    mask, motion = outline.view(np.uint8), maps.motion[box.pixels]
+    mean, largest = cv2.mean(motion, mask)[0], cv2.minMaxLoc(motion, mask)[1]
+    shares = (math.log(y.size / maps.motion.size), y.size / outline.size, min(shape.nearness_to_band, 2.0))
+    seam = float(sigmoid(maps.seam_logit[at]).sum()) / blocks.size
+    return np.array([_logit(mean), _logit(largest), *shares, seam, *means], dtype=np.float64)
 
 
 def sigmoid(logits: Float32Array) -> Float32Array:
@@ -220,13 +217,16 @@ def sigmoid(logits: Float32Array) -> Float32Array:
 
 
 def _logit(probability: float) -> float:
-    return float(np.clip(np.log(probability / max(1 - probability, 1e-9)), -MAX_LOGIT, MAX_LOGIT))
+    odds = probability / max(1 - probability, 1e-9)
+    return min(max(math.log(odds), -MAX_LOGIT), MAX_LOGIT) if odds > 0 else -MAX_LOGIT
 
 
 def probability_of(features: Float64Array, score: RegionScore) -> float:
     """That a region moves by itself, 0..1, rounded so that equal scores tie in the written answer as well."""
-    logit = float(features @ np.array(score.weights)) + score.bias if score.weights else float(features[0])
-    return round(1 / (1 + float(np.exp(-np.clip(logit, -MAX_LOGIT, MAX_LOGIT)))), 4)
+    logit = float(features[0])
+    if score.weights:
+        logit = score.bias + sum(weight * one for weight, one in zip(score.weights, features.tolist(), strict=True))
+    return round(1 / (1 + math.exp(-min(max(logit, -MAX_LOGIT), MAX_LOGIT))), 4)
 
 
 def _evidence(features: Float64Array, shape: Shape, ratio: float, config: RegionConfig) -> dict[str, float | str]:
@@ -239,7 +239,7 @@ def _evidence(features: Float64Array, shape: Shape, ratio: float, config: Region
             ("parallax", HALF_PARALLAX_PX),
         )
     )
-    probability, needed = 1 / (1 + float(np.exp(-features[0]))), config.min_motion_probability
+    probability, needed = 1 / (1 + math.exp(-features[0])), config.min_motion_probability
     if probability <= needed:  # a faint thing
         needed = min(needed, config.faint_motion_probability)
     return {
