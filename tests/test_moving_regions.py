@@ -107,6 +107,19 @@ def test_a_band_is_model_error_and_scores_below_a_half() -> None:
     assert region.score == BAND_SCORE
 
 
+@pytest.mark.parametrize(("side_px", "label"), [(10, "independent_motion"), (9, "model_error")])
+def test_what_is_narrow_has_a_limit_of_its_own(side_px: int, label: str) -> None:
+    fraction = 9.5 / float(np.hypot(*SHAPE))
+    for box in ((slice(20, 50), slice(30, 30 + side_px)), (slice(20, 20 + side_px), slice(30, 60))):
+        config = CONFIG.model_copy(update={"min_motion_extent_fraction": fraction, "min_x_extent_fraction": 0.5})
+        assert only(regions_of(maps(box), config)).label == label
+
+
+def only(regions: list[Region]) -> Region:
+    (region,) = regions
+    return region
+
+
 def test_what_is_most_of_the_picture_is_model_error() -> None:
     (region,) = regions_of(maps((slice(4, 92), slice(4, 120)), probability=0.99))
     assert (region.label, region.score, region.evidence["rule"]) == ("model_error", BAND_SCORE, "most_of_the_picture")

@@ -213,9 +213,9 @@ class RegionConfig(FrozenConfig):
     """From evidence to labelled regions; see ``regions`` and ``moving_regions`` for each step.
 
     Fractions are of the image diagonal unless the name says otherwise; the residual is in gray levels 0-255.
-    Regions of learned evidence (``moving_regions``) know ``min_motion_probability`` and
-    ``faint_motion_probability`` in place of ``threshold_mads``, ``min_residual_gray``, smoothing, opening and
-    closing.
+    Regions of learned evidence (``moving_regions``) know ``min_motion_probability``, ``faint_motion_probability`` and
+    ``min_motion_extent_fraction`` in place of ``threshold_mads``, ``min_residual_gray``, smoothing, opening, closing
+    and the smallest extents in x and in y.
     """
 
     texture_softening_gray: float = Field(
@@ -240,8 +240,15 @@ class RegionConfig(FrozenConfig):
     shape_rule: ShapeRuleName = Field(
         default="axis_aligned", description="what tells motion from narrow bands; axis_aligned: the paper's"
     )
-    min_x_extent_fraction: float = Field(default=0.008, ge=0, le=1, description="of the diagonal: narrower is a band")
-    min_y_extent_fraction: float = Field(default=0.008, ge=0, le=1, description="of the diagonal: narrower is a band")
+    min_x_extent_fraction: float = Field(
+        default=0.018, ge=0, le=1, description="of the diagonal, in the residual: narrower is a band"
+    )
+    min_y_extent_fraction: float = Field(
+        default=0.018, ge=0, le=1, description="of the diagonal, in the residual: narrower is a band"
+    )
+    min_motion_extent_fraction: float = Field(
+        default=0.008, ge=0, le=1, description="of the diagonal, with learned evidence: narrower in x or y is a band"
+    )
     max_aspect_ratio: float = Field(default=5.0, ge=1, description="a longer bounding box is a band")
     motion_score: float = Field(
         default=0.5, ge=0.5, le=1.01, description="independent_motion scores at least this; above 1: nothing does"

@@ -27,10 +27,9 @@ from viflow_anomaly.regions import (
     largest_components,
     pixels_of,
     region_of,
-    shape_limits,
 )
 from viflow_anomaly.sensor_data import Float64Array
-from viflow_anomaly.shape_rule import Shape, judge_shape, thickness_px
+from viflow_anomaly.shape_rule import Shape, ShapeLimits, judge_shape, thickness_px
 
 SEAM_LOGIT = 0.0
 """Where a seam is as likely as none."""
@@ -108,7 +107,7 @@ def measure_regions(
     y, x = pixels_of(mask[part])
     labels = _things(maps, mask[part], part, config)[mask[part]]
     components = largest_components(y + top, x + left, labels, mask.size, config)
-    limits, compared_px = shape_limits(config, float(np.hypot(*mask.shape))), np.count_nonzero(inside)
+    limits, compared_px = _shape_limits(config, float(np.hypot(*mask.shape))), np.count_nonzero(inside)
     measured = []
     for component in components:
         box, outline = component.outline()
@@ -144,6 +143,12 @@ def find_moving_regions(
     """
     regions = [_judge(one, residual, score, config) for one in measure_regions(maps, cues, inside, config)]
     return sorted(regions, key=lambda region: (-region.score, region.bbox.y, region.bbox.x))
+
+
+def _shape_limits(config: RegionConfig, diagonal_px: float) -> ShapeLimits:
+    """The head marks no edges: what is narrow there is small or far away, unless it is next to nothing."""
+    least_px = config.min_motion_extent_fraction * diagonal_px
+    return ShapeLimits(least_px, least_px, config.max_aspect_ratio)
 
 
 def _judge(measured: MeasuredRegion, residual: Float32Array, score: RegionScore, config: RegionConfig) -> Region:
