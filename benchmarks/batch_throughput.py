@@ -3,7 +3,8 @@
 The recording is the bundled sample, played again and again, or the one that is named. A speed-up is only what free
 cores give: each round says how much of them other programs took, and the verdict is left open where that was too much.
 Beside the wall clock stands what no other program disturbs: processor seconds of a run with one job over the share of
-them that each of N jobs needs ("with free cores": the start of helpers is in it, waiting is not).
+them that each of N jobs needs ("with free cores": the start of helpers is in it, waiting is not). And "apart": what N
+programs reach that share nothing and write nothing, each judging all pairs by itself. No batch can do better there.
 
     python benchmarks/batch_throughput.py --out benchmarks/results/batch-throughput.json
 """
@@ -51,6 +52,7 @@ from viflow_anomaly.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
 WANTED_SPEED_UP = 1.8
+PATIENCE_S = 600.0
 MAX_GROWTH_MIB = 24.0
 """Of the largest process from the shortest to the longest recording: what an allocator keeps, and a table of stamps."""
 
@@ -78,6 +80,35 @@ def run_threads(recording: Recording, detector: AnomalyDetector, threads: int) -
         for _ in pool.map(lambda index: to_json(detector.analyze(pairs[index]).detection), range(len(pairs))):
             pass
     return spent
+
+
+def speed_up_apart(folder: Path, evidence: str, *, frames: int, programs: int) -> float:
+    """How many times the pairs a second of one program several reach that have nothing to do with each other."""
+    alone, together = (_slowest_s(folder, evidence, frames, count) for count in (1, programs))
+    return round(programs * alone / together, 3)
+
+
+def _slowest_s(folder: Path, evidence: str, frames: int, programs: int) -> float:
+    context = multiprocessing.get_context("spawn")
+    start, answers = context.Barrier(programs), context.Queue()
+    started = [
+        context.Process(target=_judge_all, args=(folder, evidence, frames, start, answers)) for _ in range(programs)
+    ]
+    for one in started:
+        one.start()
+    seconds = [answers.get(timeout=PATIENCE_S) for _ in started]
+    for one in started:
+        one.join()
+    return float(max(seconds))
+
+
+def _judge_all(folder: Path, evidence: str, frames: int, start: Any, answers: Any) -> None:
+    keep_freed_memory()
+    recording = repeated(open_recording(folder, limits=ImageLimits()), frames)
+    detector = load_detector(settings_of(evidence))
+    run_threads(recording, detector, 1)  # warm-up
+    start.wait(PATIENCE_S)
+    answers.put(run_threads(recording, detector, 1).wall_s)
 
 
 def compare(recording: Recording, evidence: str, *, jobs: int, rounds: int) -> dict[str, Any]:
@@ -150,14 +181,15 @@ def _peaks(folder: Path, frames: int, jobs: int) -> tuple[float, float]:
 
 def markdown(results: Sequence[dict[str, Any]], memory: Sequence[dict[str, float]]) -> str:
     lines = [
-        "| evidence | pairs/s, 1 job | N jobs | N threads | speed-up | with free cores | identical | verdict |",
-        "|---|---|---|---|---|---|---|---|",
+        "| evidence | pairs/s, 1 job | N jobs | N threads | speed-up | with free cores | apart | identical | verdict |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for one in results:
         rate = one["pairs_per_s"]
         lines.append(
             f"| {one['evidence']} | {rate['one_job']} | {rate['jobs']} | {rate['threads']} | {one['speed_up']:.2f} | "
-            f"{one['speed_up_with_free_cores']:.2f} | {one['identical']} | {one['verdict']} |"
+            f"{one['speed_up_with_free_cores']:.2f} | {one['speed_up_apart']:.2f} | {one['identical']} | "
+            f"{one['verdict']} |"
         )
     lines += ["", "| frames | jobs | process, MiB | largest helper, MiB |", "|---|---|---|---|"]
     lines += [
@@ -192,6 +224,8 @@ def main() -> None:
         compare(recording, evidence, jobs=arguments.jobs, rounds=arguments.rounds) for evidence in ("auto", "residual")
     ]
     for one in results:
+        loops = {"frames": min(arguments.frames, 200), "programs": arguments.jobs}
+        one["speed_up_apart"] = speed_up_apart(arguments.recording, one["evidence"], **loops)
         one["verdict"] = verdict(one)
     lengths = [int(length) for length in arguments.lengths.split(",") if length]
     memory = [memory_of(arguments.recording, length, jobs) for jobs in (1, arguments.jobs) for length in lengths]
