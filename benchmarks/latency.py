@@ -138,10 +138,8 @@ class Stages:
         lap()
         judged = None if cues is None else judge_cues(self._head, cues, explained)
         lap()
-        regions, coordinates = regions_of(explained, judged, self._head, self._config), explained.target_coordinates
-        if size is not None and regions:
-            regions, coordinates = [size.region(region) for region in regions], size.coordinates(coordinates)
-        rois_from_regions(regions, image, target_coordinates=coordinates)
+        regions = regions_of(explained, judged, self._head, self._config)
+        rois_from_regions(regions if size is None else [size.region(region) for region in regions], image)
         lap()
         return [(after - before) * 1e3 for before, after in pairwise(clock)]
 

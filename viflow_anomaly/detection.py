@@ -146,6 +146,7 @@ def rois_from_regions(
     include_masks: bool = False,
     offset: tuple[int, int] = (0, 0),
     target_coordinates: Float32Array | None = None,
+    step_px: tuple[float, float] = (1.0, 1.0),
 ) -> tuple[Roi, ...]:
     """Number the regions from 1 in their order.
 
@@ -156,21 +157,26 @@ def rois_from_regions(
         offset: (x, y) where the residual map begins in the image.
         target_coordinates: [H, W, 2] (u, v) where the static world at each pixel of the map is in the target image; the
             ROIs' evidence then says the static flow at their middle.
+        step_px: (x, y) pixels of the regions for one of ``target_coordinates``, which may be of a smaller picture.
     """
-    static = [{} if target_coordinates is None else _static_flow(region, target_coordinates) for region in regions]
+    static = [
+        {} if target_coordinates is None else _static_flow(region, target_coordinates, step_px) for region in regions
+    ]
     return tuple(
         _roi(number, region, image, include_masks, offset, flow)
         for number, (region, flow) in enumerate(zip(regions, static, strict=True), start=1)
     )
 
 
-def _static_flow(region: Region, target_coordinates: Float32Array) -> dict[str, EvidenceValue]:
+def _static_flow(
+    region: Region, target_coordinates: Float32Array, step_px: tuple[float, float]
+) -> dict[str, EvidenceValue]:
     """At the pixel in the middle of the box; rounded here, so that tracking a value and its JSON is the same."""
-    u, v = (int(middle) for middle in region.bbox.middle_px)
+    u, v = (int((int(middle) + 0.5) / step) for middle, step in zip(region.bbox.middle_px, step_px, strict=True))
     target = target_coordinates[v, u].tolist()
     return {
-        name: round(there - here, PIXEL_DECIMALS) + 0.0 if np.isfinite(there) else None
-        for name, there, here in zip(STATIC_FLOW_NAMES, target, (u, v), strict=True)
+        name: round((there - here) * step, PIXEL_DECIMALS) + 0.0 if np.isfinite(there) else None
+        for name, there, here, step in zip(STATIC_FLOW_NAMES, target, (u, v), step_px, strict=True)
     }
 
 

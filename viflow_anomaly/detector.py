@@ -247,11 +247,14 @@ class AnomalyDetector:
         self, explained: Explanation, judged: JudgedCues | None, image: ImageSize, size: InternalSize | None
     ) -> tuple[Roi, ...]:
         """In source pixels."""
-        regions, coordinates = regions_of(explained, judged, self._evidence, self.config), explained.target_coordinates
-        if size is not None and regions:
-            regions, coordinates = [size.region(region) for region in regions], size.coordinates(coordinates)
-        masks = self.config.include_masks
-        return rois_from_regions(regions, image, include_masks=masks, target_coordinates=coordinates)
+        regions = regions_of(explained, judged, self._evidence, self.config)
+        return rois_from_regions(
+            regions if size is None else [size.region(region) for region in regions],
+            image,
+            include_masks=self.config.include_masks,
+            target_coordinates=explained.target_coordinates,
+            step_px=(1.0, 1.0) if size is None else size.step_px,
+        )
 
     def _findings(self, pair: FramePair, explained: Explanation, *, shares_scene: bool) -> tuple[Finding, ...]:
         """What can be said against the pair, and whether it can be judged at all."""
