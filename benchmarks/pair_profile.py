@@ -38,6 +38,7 @@ from viflow_anomaly.config import RuntimeName
 from viflow_anomaly.detector import AnomalyDetector
 
 PARTS = (
+    "internal_size.InternalSize.reduce",
     "model_input.prepare",
     "motion_input.build_motion_window",
     "view.InternalView.render",
@@ -70,6 +71,7 @@ PARTS = (
     "detector._summary",
     "motion_evidence.regions_of",
     "moving_regions.measure_regions",
+    "internal_size.InternalSize.region",
     "detection.rois_from_regions",
 )
 """Functions and methods below ``viflow_anomaly``, in the order in which a pair meets them."""

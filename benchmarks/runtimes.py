@@ -108,7 +108,7 @@ def measure_latency(files: Files, *, repeats: int, warm_up: int) -> list[dict[st
     rows = []
     for width, height in SIZES:
         pair = make_case(sample, width, height, "pinhole").pair
-        given, (cues, _) = prepare(pair, model), detector.cues(pair)
+        given, (cues, _) = prepare(pair, model), detector.cues(detector.as_judged(pair, for_head=True))
         calls: dict[str, dict[str, Callable[[], object]]] = {"network": {}, "evidence head": {}}
         for one in VARIANTS:
             network = load_runtime(files.network, runtime=one.runtime, precision=one.precision, threads=1).runtime

@@ -32,7 +32,7 @@ HALF_TEXTURE_GRAY2 = 8.0
 MIN_SHIFT_PX = 0.5
 """A common motion is worth moving the coordinates by, where its root mean square over the blocks is this much."""
 MIN_HALVED_SIDE_PX = 64
-MIN_STEP_PX = 1.95
+MIN_STEP_PX = 1.8
 """Source pixels for one view pixel; with fewer, halves of the image show no more than the view did."""
 NEIGHBOURHOOD = 1 / 8
 """Side of what is corrected in depth as a whole, in image widths: a smaller thing cannot explain itself away."""

@@ -325,7 +325,7 @@ class QualityConfig(FrozenConfig):
     )
 
 
-MIN_INTERNAL_SIDE_PX, MAX_INTERNAL_SIDE_PX = 64, 16384
+MIN_INTERNAL_SIDE_PX, MAX_INTERNAL_SIDE_PX = 128, 16384
 
 
 class DetectorConfig(FrozenConfig):
@@ -524,3 +524,5 @@ class TrainingConfig(FrozenConfig):
 FINE_TUNING_DEFAULTS = {"steps": 1000, "learning_rate": 3e-4, "warmup_steps": 100}
 """What a training that starts from a checkpoint has instead of ``TrainingConfig``'s defaults: it is near its goal, and
 its recordings are few."""
+EVIDENCE_FINE_TUNING_DEFAULTS = {"steps": 5000, "learning_rate": 1e-3}
+"""Likewise of an evidence head."""

@@ -29,7 +29,14 @@ from viflow_anomaly.explanation import Explanation, explain
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.internal_size import InternalSize, internal_size
 from viflow_anomaly.model_input import prepare
-from viflow_anomaly.motion_evidence import JudgedCues, judge_cues, regions_of, require_our_cues, takes_head
+from viflow_anomaly.motion_evidence import (
+    JudgedCues,
+    expects_head,
+    judge_cues,
+    regions_of,
+    require_our_cues,
+    takes_head,
+)
 from viflow_anomaly.motion_input import MotionWindow
 from viflow_anomaly.pair_detector import Execution, LoadedWeights
 from viflow_anomaly.pair_quality import Finding, judge_correction, judge_images, judge_window
@@ -233,15 +240,23 @@ class AnomalyDetector:
         found_in = nothing if judged is None else judged.maps.motion
         return Analysis(detection, explained, found_in, learned, size)
 
-    def internal_size(self, pair: FramePair) -> InternalSize | None:
-        """At what size the pair is judged; None: its own, always where no evidence head takes part."""
-        config, model = self.config, self._record.model
-        knows_depth = model.preset == "calibrated" and config.correction.enabled
-        takes_part = config.evidence == "learned" or (config.evidence == "auto" and knows_depth)
-        if self._evidence is None or not takes_part or model.view.mode == "center_crop":
+    def internal_size(self, pair: FramePair, *, for_head: bool = False) -> InternalSize | None:
+        """At what size the pair is judged; None: its own, always where no evidence head takes part.
+
+        Args:
+            for_head: as if one did.
+        """
+        model = self._record.model
+        takes_part = for_head or expects_head(self._evidence, model, self.config)
+        if model.view.mode == "center_crop" or not takes_part:
             return None
         height, width = pair.source.image.shape
-        return internal_size(width, height, config.internal_short_side_px)
+        return internal_size(width, height, self.config.internal_short_side_px, pair.camera)
+
+    def as_judged(self, pair: FramePair, *, for_head: bool = False) -> FramePair:
+        """The pair at its ``internal_size``."""
+        size = self.internal_size(pair, for_head=for_head)
+        return pair if size is None else size.reduce(pair)
 
     def _rois(
         self, explained: Explanation, judged: JudgedCues | None, image: ImageSize, size: InternalSize | None
@@ -280,8 +295,7 @@ class AnomalyDetector:
         Raises:
             InvalidInputError: as ``detect``.
         """
-        size = self.internal_size(pair)
-        explained, alignment = self._explain(pair if size is None else size.reduce(pair))
+        explained, alignment = self._explain(self.as_judged(pair))
         judged = self._judge(explained, alignment)
         return None if judged is None else (judged, explained.inside)
 

@@ -50,7 +50,7 @@ def head_samples(recordings: Sequence[Path], detector: AnomalyDetector, limits: 
     """What an evidence head is shown behind the detector's network; otherwise as ``network_samples``."""
 
     def shown(pair: FramePair) -> Feed:
-        cues, _ = detector.cues(pair)
+        cues, _ = detector.cues(detector.as_judged(pair, for_head=True))
         photometric, geometric = cues
         return {"photometric": np.array(photometric)[None], "geometric": np.array(geometric)[None]}
 

@@ -1,23 +1,23 @@
 """A large picture is judged at a smaller size, and told in the pixels it came in.
 
-What the evidence head costs grows with the pixels; what it finds hardly does: docs/detection.md has the curve. Boxes
-grow outwards to whole pixels, maps are interpolated.
+What the evidence head costs grows with the pixels; what it finds hardly does: docs/detection.md has the curve. On the
+way back a source pixel belongs to the internal pixel that its middle lies in; what is continuous is interpolated.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.geometry import Float32Array, cached_pixel_grid
 from viflow_anomaly.moving_regions import LENGTHS
-from viflow_anomaly.regions import BoundingBox, Region
-from viflow_anomaly.sensor_data import Frame, FramePair
+from viflow_anomaly.regions import BoundingBox, IndexArray, Region
+from viflow_anomaly.sensor_data import MIN_FOCAL_LENGTH_PX, Frame, FramePair, PinholeCamera
 
 WORTH_IT = 1.25
 """A picture whose shorter side is up to this many times the wanted one stays as it is: little would be saved."""
@@ -50,58 +50,74 @@ class InternalSize(NamedTuple):
         return replace(pair, source=source, target=target, camera=camera)
 
     def box(self, box: BoundingBox) -> BoundingBox:
-        """In source pixels."""
-        step_x, step_y = self.step_px
-        left, top = math.floor(box.x * step_x), math.floor(box.y * step_y)
-        right = min(self.source_width, math.ceil((box.x + box.width) * step_x))
-        bottom = min(self.source_height, math.ceil((box.y + box.height) * step_y))
+        """The source pixels whose middles lie in a box of internal pixels."""
+        left, right = (_first_pixel(x, self.source_width, self.width) for x in (box.x, box.x + box.width))
+        top, bottom = (_first_pixel(y, self.source_height, self.height) for y in (box.y, box.y + box.height))
         return BoundingBox(left, top, right - left, bottom - top)
 
     def region(self, region: Region) -> Region:
-        """In source pixels: box, mask, area, thickness, and the lengths in its evidence."""
+        """In source pixels: box, mask, area, thickness, and what its evidence tells of shape and in lengths."""
         box, step = self.box(region.bbox), math.sqrt(math.prod(self.step_px))
-        mask = cv2.resize(region.mask.view(np.uint8), (box.width, box.height), interpolation=cv2.INTER_NEAREST) != 0
+        rows, columns = self._at(box)
+        mask = region.mask[np.ix_(rows - region.bbox.y, columns - region.bbox.x)]
+        area_px = int(np.count_nonzero(mask))
+        shape = {"fill_ratio": area_px / mask.size, "aspect_ratio": max(mask.shape) / min(mask.shape)}
         lengths = {name: step * float(region.evidence[name]) for name in LENGTHS if name in region.evidence}
         return replace(
             region,
             bbox=box,
             x_extent_px=box.width,
             y_extent_px=box.height,
-            area_px=int(np.count_nonzero(mask)),
+            area_px=area_px,
             thickness_px=step * region.thickness_px,
-            evidence={**region.evidence, **lengths},
-            mask=np.asarray(mask, dtype=np.bool_),
+            evidence={**region.evidence, **shape, **lengths},
+            mask=mask,
         )
 
     def map(self, values: Float32Array) -> Float32Array:
         """[height, width(, C)] -> [source_height, source_width(, C)], bilinear."""
-        return np.asarray(self._resized(values, cv2.INTER_LINEAR), dtype=np.float32)
+        size = (self.source_width, self.source_height)
+        return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32)
 
     def mask(self, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Likewise, each pixel as the nearest one."""
-        return np.asarray(self._resized(inside.view(np.uint8), cv2.INTER_NEAREST), dtype=np.bool_)
+        """[height, width] -> [source_height, source_width]."""
+        return inside[np.ix_(*self._at(BoundingBox(0, 0, self.source_width, self.source_height)))]
 
     def coordinates(self, target_px: Float32Array) -> Float32Array:
         """[height, width, 2] positions in the internal target -> [source_height, source_width, 2] in the source's."""
-        whole = self.map(target_px)
-        whole += np.float32(0.5)
-        whole *= np.array(self.step_px, dtype=np.float32)
-        whole -= np.float32(0.5)
-        return whole
+        flow = self.map(target_px - cached_pixel_grid(self.height, self.width))
+        flow *= np.array(self.step_px, dtype=np.float32)
+        flow += cached_pixel_grid(self.source_height, self.source_width)
+        return flow
 
-    def _resized(self, values: NDArray[Any], interpolation: int) -> NDArray[Any]:
-        size = (self.source_width, self.source_height)
-        return np.asarray(cv2.resize(values, size, interpolation=interpolation))
+    def _at(self, box: BoundingBox) -> tuple[IndexArray, IndexArray]:
+        """Internal row of each row of a box of source pixels, and internal column of each column."""
+        rows = np.arange(box.y, box.y + box.height)
+        columns = np.arange(box.x, box.x + box.width)
+        return (
+            (2 * rows + 1) * self.height // (2 * self.source_height),
+            (2 * columns + 1) * self.width // (2 * self.source_width),
+        )
 
 
-def internal_size(width: int, height: int, short_side_px: int) -> InternalSize | None:
+def _first_pixel(edge: int, source_side: int, side: int) -> int:
+    """The first source pixel whose middle is not before an internal pixel's edge; exact, in whole numbers."""
+    return -((side - 2 * edge * source_side) // (2 * side))
+
+
+def internal_size(
+    width: int, height: int, short_side_px: int, camera: PinholeCamera | None = None
+) -> InternalSize | None:
     """The size at which a width x height picture is judged; None: its own.
 
     Args:
         short_side_px: of the judged picture, whatever its proportions; 0: every picture is judged as it came.
+        camera: of the picture; one whose focal length would be none at the smaller size keeps its own.
     """
     shorter = min(width, height)
     if not short_side_px or shorter <= WORTH_IT * short_side_px:
         return None
     scale = short_side_px / shorter
+    if camera is not None and min(camera.fx, camera.fy) * scale < 2 * MIN_FOCAL_LENGTH_PX:
+        return None
     return InternalSize(round(width * scale), round(height * scale), width, height)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from viflow_anomaly.checkpoint_record import EvidenceRecord
-from viflow_anomaly.config import MAX_OFFSET_BLOCKS, DetectorConfig
+from viflow_anomaly.config import MAX_OFFSET_BLOCKS, DetectorConfig, ModelConfig
 from viflow_anomaly.errors import CheckpointError
 from viflow_anomaly.evidence_cues import CUES_VERSION, GEOMETRIC_CUES, PHOTOMETRIC_CUES, EvidenceCues
 from viflow_anomaly.explanation import Explanation
@@ -54,6 +54,13 @@ def require_our_cues(record: EvidenceRecord) -> None:
             code="checkpoint_record_invalid",
             field="evidence_head",
         )
+
+
+def expects_head(head: LoadedEvidence | None, model: ModelConfig, config: DetectorConfig) -> bool:
+    """``takes_head`` before a pair is seen: of the networks the calibrated one knows depth, where it is corrected."""
+    if head is None or config.evidence == "residual":
+        return False
+    return config.evidence == "learned" or (model.preset == "calibrated" and config.correction.enabled)
 
 
 def takes_head(head: LoadedEvidence | None, predicted: PredictedFlow, config: DetectorConfig) -> bool:

@@ -11,7 +11,8 @@ import torch
 from viflow_anomaly.checkpoint import LoadedEvidenceHead, load_checkpoint, load_evidence_head
 from viflow_anomaly.checkpoint_record import CheckpointRecord, EvidenceRecord
 from viflow_anomaly.config import EvidenceHeadConfig, FrozenConfig, ModelConfig
-from viflow_anomaly.errors import ConfigError
+from viflow_anomaly.errors import CheckpointError, ConfigError
+from viflow_anomaly.evidence_cues import GEOMETRIC_CUES, PHOTOMETRIC_CUES
 
 
 class InitialWeights(NamedTuple):
@@ -45,8 +46,20 @@ def read_initial_weights(path: Path, asked: ModelConfig) -> InitialWeights:
 
 
 def read_initial_head(path: Path, asked: EvidenceHeadConfig) -> LoadedEvidenceHead:
-    """The evidence head to start from, also one of an older cues' arithmetic; arguments and errors as above."""
+    """The evidence head to start from, also one of an older cues' arithmetic; arguments and errors as above.
+
+    Raises:
+        CheckpointError: ``evidence_cues_differ`` for one that was trained on other cues.
+    """
     loaded = load_evidence_head(path)
+    found = loaded.record.photometric_cues, loaded.record.geometric_cues
+    if found != (PHOTOMETRIC_CUES, GEOMETRIC_CUES):
+        raise CheckpointError(
+            f"{path}: with --init expected a head that was trained on the cues {PHOTOMETRIC_CUES + GEOMETRIC_CUES}, "
+            f"found {found[0] + found[1]}",
+            code="evidence_cues_differ",
+            field="init",
+        )
     _require_same(path, "evidence_training.head", asked, loaded.record.head)
     return loaded
 

@@ -21,7 +21,10 @@ from viflow_anomaly.cli.options import (
     settings_from,
 )
 from viflow_anomaly.cli.progress import stderr_progress
+from viflow_anomaly.config import EVIDENCE_FINE_TUNING_DEFAULTS
 from viflow_anomaly.errors import DatasetError
+
+FINE_TUNING = ", ".join(f"{key}={value:g}" for key, value in EVIDENCE_FINE_TUNING_DEFAULTS.items())
 
 
 def train_evidence(
@@ -35,7 +38,11 @@ def train_evidence(
     ],
     init: Annotated[
         Path | None,
-        typer.Option(metavar="default|PATH", help="Start from a head's weights (default: the bundled one's)."),
+        typer.Option(
+            metavar="default|PATH",
+            help="Start from a head's weights (the word default: the bundled one's) and take its structure. Unless "
+            f"they are set, {FINE_TUNING}.",
+        ),
     ] = None,
     steps: Steps = None,
     seed: Seed = None,
@@ -65,7 +72,8 @@ def train_evidence(
         "checkpoint": checkpoint,
         "device": device,
     }
-    settings = settings_from(config, assignments, options)
+    fine_tuning = {f"evidence_training.{key}": value for key, value in EVIDENCE_FINE_TUNING_DEFAULTS.items()}
+    settings = settings_from(config, assignments, options, defaults=None if init is None else fine_tuning)
     # There is no head yet, and the one that comes judges every pair.
     settings = settings.model_copy(update={"detector": settings.detector.model_copy(update={"evidence": "auto"})})
     from viflow_anomaly.checkpoint_record import bundled_evidence_head

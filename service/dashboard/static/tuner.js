@@ -16,7 +16,14 @@ const FIELDS = {
   max_aspect_ratio: ["Longest over shortest side", 1, 20, 0.5],
   min_motion_extent_fraction: ["Narrowest side", 0, 0.15, 0.002],
 };
-const RESIDUAL_FIELDS = { threshold_mads: ["Threshold over the background", 1, 30, 0.5], min_residual_gray: ["Least residual", 0, 60, 0.5] };
+const RESIDUAL_FIELDS = {
+  threshold_mads: ["Threshold over the background", 1, 30, 0.5],
+  min_residual_gray: ["Least residual", 0, 60, 0.5],
+  min_area_fraction: FIELDS.min_area_fraction,
+  max_aspect_ratio: FIELDS.max_aspect_ratio,
+  min_x_extent_fraction: ["Narrowest, left to right", 0, 0.15, 0.002],
+  min_y_extent_fraction: ["Narrowest, top to bottom", 0, 0.15, 0.002],
+};
 const RULES = { axis_aligned: "sides of the box (the paper's)", oriented: "sides of a turned box", thickness: "largest disc inside", none: "every shape passes" };
 
 const controls = new Map();
