@@ -44,7 +44,7 @@ class Judged(NamedTuple):
 
 @dataclass
 class Identity:
-    """How movers keep their numbers, and how well their speed is known."""
+    """How movers keep their numbers, and how well their speed is known; of one in parts the best fitting one counts."""
 
     kept: int = 0
     changed: int = 0
@@ -57,11 +57,10 @@ class Identity:
         sightings: dict[int, int] = {}
         for detection, labels, mover_ids in sequence:
             interval_s = (detection.target_timestamp_ns - detection.source_timestamp_ns) * 1e-9
-            for roi in detection.rois:
-                movers = zip(labels.objects, mover_ids, strict=True)
-                overlaps = [(iou(roi.bbox, thing.bbox), k, thing) for thing, k in movers if thing.counted]
-                best, mover_id, mover = max(overlaps, key=lambda one: one[:2], default=(0.0, 0, None))
-                if best < MIN_IOU or mover is None:
+            for mover, mover_id in zip(labels.objects, mover_ids, strict=True):
+                overlaps = [(iou(roi.bbox, mover.bbox), -roi.id, roi) for roi in detection.rois]
+                best, _, roi = max(overlaps, key=lambda one: one[:2], default=(0.0, 0, None))
+                if best < MIN_IOU or roi is None or not mover.counted:
                     continue
                 self.found += 1
                 if roi.track_id is None:
