@@ -17,9 +17,11 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from viflow_anomaly_service.access_rules import (
     SAFE_METHODS,
     is_direct_from_here,
+    is_foreign_name,
     is_foreign_page,
     is_loopback,
     is_open,
+    is_own_page,
     required_scope,
 )
 from viflow_anomaly_service.api_keys import ApiKey, KeyRing
@@ -121,13 +123,19 @@ class AccessMiddleware:
 
     def _require_reachable(self, scope: Scope, headers: Headers) -> None:
         """Without keys: for this machine alone, unless it was said otherwise; not for pages of other sites."""
+        allowed, method = self._settings.allowed_origins, scope.get("method", "GET")
         if self._settings.insecure_no_keys:
+            if method not in SAFE_METHODS and is_foreign_page(headers, allowed, method) and not is_own_page(headers):
+                raise _origin_refused()
             return
         server = scope.get("server")
         if server is not None and server[1] is not None and not is_loopback(server[0]):
             detail = "The service was started without keys, and answers on this machine's loopback address only."
             raise Problem(403, code="keys_missing", detail=detail)
-        if is_foreign_page(headers, self._settings.allowed_origins):
+        if is_foreign_name(headers, allowed):
+            detail = "expected a request to this machine's loopback address or to an allowed origin, found another name"
+            raise Problem(403, code="host_refused", detail=detail, field="Host")
+        if is_foreign_page(headers, allowed, method):
             raise _origin_refused()
 
     def _allowance(self, key: ApiKey | None) -> Allowance:

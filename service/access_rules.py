@@ -78,15 +78,44 @@ def is_direct_from_here(client: str, headers: Mapping[str, str]) -> bool:
     return is_loopback(client) and not any(name in headers for name in _FORWARDED)
 
 
-def is_foreign_page(headers: Mapping[str, str], allowed_origins: tuple[str, ...]) -> bool:
-    """Whether a web page of another site sent the request: a browser would let any page post to this machine."""
+def is_foreign_page(headers: Mapping[str, str], allowed_origins: tuple[str, ...], method: str = "GET") -> bool:
+    """Whether a web page of another site sent the request: a browser would let any page post to this machine.
+
+    What changes something comes with its page's origin, or is at least said to come from another site; what only reads
+    may come without either, but its answer is not given to the page.
+    """
     origin = headers.get("origin")
-    if origin is None or origin in allowed_origins:
+    if origin is None:
+        return method not in SAFE_METHODS and headers.get("sec-fetch-site") == "cross-site"
+    return origin not in allowed_origins and not is_loopback(_host_of(origin))
+
+
+def is_own_page(headers: Mapping[str, str]) -> bool:
+    """Whether the service's own page sent the request, by whatever name its reader knows the service: the browser says
+    so (behind a proxy, too), or an old one asks where the page came from."""
+    if (site := headers.get("sec-fetch-site")) is not None:
+        return site == "same-origin"
+    return headers.get("origin", "").partition("://")[2].lower() == headers.get("host", "").lower()
+
+
+def is_foreign_name(headers: Mapping[str, str], allowed_origins: tuple[str, ...]) -> bool:
+    """Whether the request was sent to a name that is neither this machine's nor an allowed origin's.
+
+    Whoever owns a name may let it point here (DNS rebinding): to a browser the service is then that site's own.
+    """
+    host = headers.get("host")
+    if not host:
         return False
+    name = _host_of(f"//{host}")
+    return not is_loopback(name) and name not in map(_host_of, allowed_origins)
+
+
+def _host_of(url: str) -> str:
+    """The host's name, or nothing where there is none."""
     try:
-        return not is_loopback(urlsplit(origin).hostname or "")
+        return urlsplit(url).hostname or ""
     except ValueError:
-        return True
+        return ""
 
 
 def require_keys_or_loopback(settings: ServiceSettings) -> None:

@@ -20,6 +20,7 @@ from viflow_anomaly_service.detector_pool import DetectorPool
 from viflow_anomaly_service.events.attach import configured_events
 from viflow_anomaly_service.events.endpoints import add_events
 from viflow_anomaly_service.events.event_rules import EndReason
+from viflow_anomaly_service.head_requests import HeadMiddleware
 from viflow_anomaly_service.live.endpoints import add_live
 from viflow_anomaly_service.live.pair_memory import PairMemory
 from viflow_anomaly_service.metrics import ServiceMetrics
@@ -92,6 +93,7 @@ def create_app(
         redirect_slashes=False,
     )
     app.state.core = core
+    app.add_middleware(HeadMiddleware)
     add_access_control(app, core.settings)
     if tracing is not None:
         app.add_middleware(TracingMiddleware, provider=tracing)

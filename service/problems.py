@@ -150,7 +150,7 @@ def problem_of_validation(err: ValidationError, prefix: str | None = None) -> Pr
 
 
 def install_problem_handlers(app: FastAPI) -> None:
-    """Make the app answer problems for ours and for the router's own 404 and 405."""
+    """Make the app answer problems for ours and for the router's own 404 and 405; ``OPTIONS`` says what there is."""
 
     @app.exception_handler(Problem)
     async def on_problem(request: Request, problem: Problem) -> Response:
@@ -161,8 +161,12 @@ def install_problem_handlers(app: FastAPI) -> None:
         phrase = HTTPStatus(err.status_code).phrase
         code = phrase.lower().replace(" ", "_")
         problem = Problem(err.status_code, code=code, detail=f"{request.method} {request.url.path}: {phrase}")
-        is_method = err.status_code == HTTPStatus.METHOD_NOT_ALLOWED
-        return _answer(request, problem, {"Allow": _allowed_methods(request)} if is_method else err.headers)
+        if err.status_code != HTTPStatus.METHOD_NOT_ALLOWED:
+            return _answer(request, problem, err.headers)
+        allowed = {"Allow": _allowed_methods(request)}
+        if request.method == "OPTIONS":
+            return Response(status_code=HTTPStatus.NO_CONTENT, headers=allowed)
+        return _answer(request, problem, allowed)
 
 
 def _allowed_methods(request: Request) -> str:
@@ -171,7 +175,9 @@ def _allowed_methods(request: Request) -> str:
     matching = [route for route in request.app.router.routes if route.matches(request.scope)[0] is not Match.NONE]
     own = min((getattr(route, "path", "") for route in matching), key=lambda path: (path.count("{"), path), default="")
     found = [route for route in matching if getattr(route, "path", "") == own]
-    return ", ".join(sorted({method for route in found for method in getattr(route, "methods", None) or ()}))
+    methods = {method for route in found for method in getattr(route, "methods", None) or ()}
+    implied = {"HEAD", "OPTIONS"} if "GET" in methods else {"OPTIONS"}
+    return ", ".join(sorted(methods | implied))
 
 
 def _answer(request: Request, problem: Problem, headers: Mapping[str, str] | None = None) -> Response:

@@ -16,7 +16,6 @@ import os
 import signal
 import socket
 import sys
-import tempfile
 import time
 from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING, Final
@@ -36,7 +35,6 @@ RESTART_SECONDS: Final = 1.0
 LOOK_SECONDS: Final = 0.2
 KILL_AFTER_SECONDS: Final = 15
 """Beyond the time that a process takes to end in order: upload, farewell, workers that finish their pair."""
-MEMORY_FOLDER: Final = "/dev/shm"  # noqa: S108 - the folder made in it is the process's own
 _PR_SET_PDEATHSIG: Final = 1
 
 
@@ -53,11 +51,13 @@ def supervise(settings: ServiceSettings, load_detector: DetectorLoader | None, s
             code="workers_unsupported",
             field="workers",
         )
+    from viflow_anomaly_service.metrics_folder import metrics_folder  # noqa: PLC0415 - fcntl is not on every system
+
     with bind(settings.host, settings.port) as alone:  # fails where anybody listens; a shared one would join in
         host, port = alone.getsockname()[:2]
     with (
         socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as reserved,
-        tempfile.TemporaryDirectory(prefix="viflow-metrics-", dir=_memory_folder()) as metrics_folder,
+        metrics_folder() as folder,
     ):
         reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         reserved.bind((host, port))  # holds the address while processes come and go; it does not listen
@@ -67,7 +67,7 @@ def supervise(settings: ServiceSettings, load_detector: DetectorLoader | None, s
             raise AssertionError(
                 "prometheus_client was imported before it could learn that processes share its numbers"
             )
-        os.environ["PROMETHEUS_MULTIPROC_DIR"] = metrics_folder
+        os.environ["PROMETHEUS_MULTIPROC_DIR"] = folder
         if load_detector is None:
             from viflow_anomaly_service.detector_loading import preload  # noqa: PLC0415 - heavy
 
@@ -77,11 +77,6 @@ def supervise(settings: ServiceSettings, load_detector: DetectorLoader | None, s
         gc.collect()
         gc.freeze()  # a collection in a process would else copy every page it looks at
         Supervisor(settings, load_detector, stop).run()
-
-
-def _memory_folder() -> str | None:
-    """Where the numbers of all processes lie: in memory, which can be written to in a read-only container, too."""
-    return MEMORY_FOLDER if os.access(MEMORY_FOLDER, os.W_OK) else None
 
 
 class Supervisor:

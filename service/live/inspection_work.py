@@ -14,17 +14,16 @@ from viflow_anomaly.errors import ViflowError
 from viflow_anomaly.inspection import flow_arrows, pair_signs, view_hypotheses
 from viflow_anomaly.sensor_data import FramePair
 from viflow_anomaly.settings import ENVIRONMENT_PREFIX
-from viflow_anomaly_service.detection_request import read_pair, validated
+from viflow_anomaly_service.detection_request import validated
 from viflow_anomaly_service.detector_pool import Job
 from viflow_anomaly_service.json_body import parse_json
 from viflow_anomaly_service.live.pair_memory import JudgedPair, RememberedPair
 from viflow_anomaly_service.live.pictures import analyzing
-from viflow_anomaly_service.metrics import ServiceMetrics
-from viflow_anomaly_service.models.table import LoadedModel, ModelSet
+from viflow_anomaly_service.models.table import LoadedModel
+from viflow_anomaly_service.pair_work import PairWork
 from viflow_anomaly_service.problems import Problem, problem_of_error, problem_of_validation
 from viflow_anomaly_service.schemas import OptionsPart, WireModel
 from viflow_anomaly_service.settings import ServiceSettings
-from viflow_anomaly_service.stage_times import StageClock
 
 
 class InspectRequest(WireModel):
@@ -65,53 +64,21 @@ class InspectionWork:
         return json_object({**members, **described_changes(detector.config, config)})
 
 
-class UploadWork:
-    """A pair that was sent to be looked at: decoded, judged, and handed back to be remembered.
-
-    Args:
-        models: of which the request chooses one.
-        body, content_type: of the request, as for ``POST /detect``.
-        settings: limits.
-        metrics: told of the detection.
-        clock: of the request.
-    """
-
-    def __init__(
-        self,
-        models: ModelSet,
-        body: bytes,
-        content_type: str,
-        *,
-        settings: ServiceSettings,
-        metrics: ServiceMetrics,
-        clock: StageClock,
-    ) -> None:
-        self._models = models
-        self._body = body
-        self._content_type = content_type
-        self._settings = settings
-        self._metrics = metrics
-        self._clock = clock
+class UploadWork(PairWork):
+    """A pair that was sent to be looked at: decoded, judged, and handed back to be remembered."""
 
     def __call__(self, job: Job[tuple[dict[str, str], JudgedPair]]) -> tuple[dict[str, str], JudgedPair]:
         """The answer's members and what is to be remembered.
 
         Raises:
             Problem: whatever is wrong with the request.
+            AbandonedError: the client has gone.
         """
-        self._clock.note("queue", job.waited_s)
-        with self._clock.stage("decode"):
-            pair, model, config, field_names = read_pair(self._models, self._body, self._content_type, self._settings)
-            self._body = b""
-        job.require_wanted()
-        with self._clock.stage("detect"):
-            try:
-                members, judged = inspect_pair(model, pair, config, view=True)
-            except ViflowError as err:
-                raise problem_of_error(err, field_names) from err
-        self._metrics.observe_detection(judged.detection, model.name)
-        self._clock.log |= {"detection": judged.detection.status, "regions": len(judged.detection.rois)}
-        return {**members, **described_changes(model.detector.config, config)}, judged
+        sent = self._decoded(job)
+        with self._judging(sent):
+            members, judged = inspect_pair(sent.model, sent.pair, sent.config, view=True)
+        self._tell(judged.detection, sent)
+        return {**members, **described_changes(sent.model.detector.config, sent.config)}, judged
 
 
 def wanted_config(options: OptionsPart | None, config: DetectorConfig) -> DetectorConfig:

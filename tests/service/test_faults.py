@@ -216,7 +216,7 @@ def test_a_client_that_stops_reading_is_given_up(tmp_path: Path) -> None:
         socket.create_connection(("127.0.0.1", server.port)) as client,
     ):
         client.settimeout(30)
-        client.sendall(b"GET /detections.ndjson HTTP/1.1\r\nHost: x\r\n\r\n")
+        client.sendall(b"GET /detections.ndjson HTTP/1.1\r\nHost: localhost\r\n\r\n")
         assert client.recv(1000).startswith(b"HTTP/1.1 200")
         for _ in range(3):
             assert server.client.get("/healthz").status_code == 200

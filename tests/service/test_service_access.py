@@ -202,6 +202,73 @@ def test_without_keys_cors_is_closed_and_foreign_pages_are_refused(server: LiveS
     assert "access-control-allow-origin" not in local.headers
 
 
+def test_without_keys_a_browser_that_names_no_origin_is_asked_where_its_page_is_from(server: LiveServer) -> None:
+    refused = server.post_json(json_request(), headers={"Sec-Fetch-Site": "cross-site"})
+    assert_problem(refused, 403, "origin_refused", "Origin")
+    for site in ("same-origin", "none"):
+        assert server.post_json(json_request(), headers={"Sec-Fetch-Site": site}).status_code == 200
+
+
+CHANGING = (
+    ("POST", "/detect"),
+    ("POST", "/inspect"),
+    ("POST", "/streams/a/frames"),
+    ("DELETE", "/streams/a"),
+    ("POST", "/streams/a/pairs/1/inspect"),
+    ("POST", "/models/a/load"),
+    ("PUT", "/models/default"),
+    ("DELETE", "/models/a"),
+    ("POST", f"/events/deliveries/{'0' * 32}.mqtt/retry"),
+)
+"""All that changes something, or takes a worker's time."""
+
+
+@pytest.mark.parametrize(("method", "path"), CHANGING)
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1.evil.example", "http://[", "x"])
+def test_without_keys_a_foreign_page_changes_nothing(server: LiveServer, method: str, path: str, origin: str) -> None:
+    for media_type in ("text/plain", "application/x-www-form-urlencoded", "multipart/form-data; boundary=x"):
+        headers = {"Origin": origin, "Content-Type": media_type}  # what a page may send without asking first
+        answer = server.client.request(method, path, headers=headers, content=b"{}")
+        assert_problem(answer, 403, "origin_refused", "Origin")
+
+
+def test_everything_that_changes_something_is_tried(server: LiveServer) -> None:
+    paths = server.client.get("/openapi.json").json()["paths"]
+    changing = {(method.upper(), path) for path, item in paths.items() for method in item if method != "get"}
+    assert len(changing) == len(CHANGING), "one more belongs into CHANGING"
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:8000", "127.0.0.1.evil.example", "10.0.0.7", "["])
+def test_without_keys_a_name_that_was_turned_to_this_machine_is_refused(server: LiveServer, host: str) -> None:
+    for path in ("/version", "/detections", "/metrics", "/live", "/docs"):
+        assert_problem(server.client.get(path, headers={"Host": host}), 403, "host_refused", "Host")
+
+
+@pytest.mark.parametrize("host", ["localhost", "LOCALHOST:1", "127.0.0.1:9000", "[::1]:8000", "127.8.0.1", ""])
+def test_without_keys_the_names_of_this_machine_are_answered(server: LiveServer, host: str) -> None:
+    assert server.client.get("/version", headers={"Host": host}).status_code == 200
+
+
+def test_an_allowed_origin_is_a_name_of_the_service() -> None:
+    with live_server(lambda settings: RuleDetector(), allowed_origins="https://robot.example") as server:
+        headers = {"Host": "robot.example", "Origin": "https://robot.example"}
+        assert server.post_json(json_request(), headers=headers).status_code == 200
+        assert_problem(server.client.get("/version", headers={"Host": "evil.example"}), 403, "host_refused", "Host")
+
+
+def test_a_service_that_everybody_may_ask_is_not_driven_by_foreign_pages() -> None:
+    with live_server(lambda settings: RuleDetector(), insecure_no_keys=True) as server:
+        address = {"Host": "robot.example:8000"}
+        evil, own = {"Origin": "http://evil.example"}, {"Origin": "http://robot.example:8000"}
+        for refused in (evil, evil | {"Sec-Fetch-Site": "cross-site"}, {"Sec-Fetch-Site": "cross-site"}):
+            answer = server.post_json(json_request(), headers=address | refused)
+            assert_problem(answer, 403, "origin_refused", "Origin")
+        proxied = {"Host": "127.0.0.1:8000", "Origin": "https://robot.example", "Sec-Fetch-Site": "same-origin"}
+        for taken in (address, address | own, proxied, address | {"Origin": "http://localhost:3000"}):
+            assert server.post_json(json_request(), headers=taken).status_code == 200
+        assert server.client.get("/version", headers=address | evil).status_code == 200
+
+
 def test_without_keys_an_address_is_limited(tmp_path: Path) -> None:
     with live_server(lambda settings: RuleDetector(), rate_limit_per_s=0.01, rate_limit_burst=3) as server:
         statuses = [server.client.get("/version").status_code for _ in range(4)]

@@ -60,11 +60,11 @@ def test_with_keys_and_a_store(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("method", "path", "allowed"),
     [
-        ("PUT", "/streams/a", "DELETE, GET"),
-        ("GET", "/detect", "POST"),
-        ("POST", "/detections/a", "GET"),
-        ("PATCH", "/models/default", "PUT"),
-        ("PUT", "/models/day", "DELETE"),
+        ("PUT", "/streams/a", "DELETE, GET, HEAD, OPTIONS"),
+        ("GET", "/detect", "OPTIONS, POST"),
+        ("POST", "/detections/a", "GET, HEAD, OPTIONS"),
+        ("PATCH", "/models/default", "OPTIONS, PUT"),
+        ("PUT", "/models/day", "DELETE, OPTIONS"),
     ],
 )
 def test_a_wrong_method_is_told_all_that_are_right(server: LiveServer, method: str, path: str, allowed: str) -> None:

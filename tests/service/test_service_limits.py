@@ -75,7 +75,7 @@ def test_chunked_body_over_the_limit(server: LiveServer) -> None:
 def test_a_client_that_asks_first_is_refused_at_once(server: LiveServer) -> None:
     started = time.monotonic()
     head = (
-        b"POST /detect HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+        b"POST /detect HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
         b"Content-Length: %d\r\nExpect: 100-continue\r\n\r\n" % 10**12
     )
     assert raw_answer(server.port, head).startswith(b"HTTP/1.1 413")
@@ -83,14 +83,14 @@ def test_a_client_that_asks_first_is_refused_at_once(server: LiveServer) -> None
 
 
 def test_slow_upload(server: LiveServer) -> None:
-    head = b"POST /detect HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 100\r\n\r\n{"
+    head = b"POST /detect HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 100\r\n\r\n{"
     answer = raw_answer(server.port, head)
     assert answer.startswith(b"HTTP/1.1 408")
     assert b'"code": "body_timeout"' in answer
 
 
 def test_an_upload_that_stalls_over_the_limit_is_answered_all_the_same(server: LiveServer) -> None:
-    head = b"POST /detect HTTP/1.1\r\nHost: x\r\nContent-Type: text/plain\r\nContent-Length: 90000\r\n\r\n{"
+    head = b"POST /detect HTTP/1.1\r\nHost: localhost\r\nContent-Type: text/plain\r\nContent-Length: 90000\r\n\r\n{"
     assert raw_answer(server.port, head).startswith(b"HTTP/1.1 415")
 
 

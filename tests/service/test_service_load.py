@@ -88,7 +88,8 @@ def test_a_turn_that_does_not_come() -> None:
 
 def begin_request(port: int, body: bytes, *, announced: int) -> socket.socket:
     connection = socket.create_connection(("127.0.0.1", port), timeout=5)
-    head = f"POST /detect HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: {announced}\r\n\r\n"
+    head = "POST /detect HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+    head += f"Content-Length: {announced}\r\n\r\n"
     connection.sendall(head.encode() + body)
     return connection
 

@@ -102,6 +102,13 @@ def test_main_turns_errors_into_a_status(
     assert capsys.readouterr().err.startswith("error: service settings: port")
 
 
+def test_arguments_are_refused_and_not_passed_over(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 2
+    found = capsys.readouterr().err
+    assert "found '--help'" in found
+    assert "viflow-anomaly serve --help" in found
+
+
 def test_main_ends_with_status_0(monkeypatch: pytest.MonkeyPatch) -> None:
     served: list[ServiceSettings] = []
     monkeypatch.setenv("VIFLOW_PORT", "1234")

@@ -6,13 +6,16 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from viflow_anomaly.errors import ConfigError
+from viflow_anomaly_service import metrics_folder as metrics_folder_module
 from viflow_anomaly_service import supervisor as supervisor_module
+from viflow_anomaly_service.metrics_folder import metrics_folder
 from viflow_anomaly_service.settings import ServiceSettings
 from viflow_anomaly_service.stop_signals import StopSignals
 from viflow_anomaly_service.supervisor import Supervisor, supervise
@@ -101,9 +104,56 @@ def test_another_system_than_linux_is_refused(monkeypatch: pytest.MonkeyPatch) -
     assert (caught.value.code, caught.value.field) == ("workers_unsupported", "workers")
 
 
-def test_without_a_folder_in_memory_the_temporary_one_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(supervisor_module, "MEMORY_FOLDER", "/no such place")
-    assert supervisor_module._memory_folder() is None
+def test_without_a_folder_in_memory_the_temporary_one_is_taken(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(metrics_folder_module, "MEMORY_FOLDER", "/no such place")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with metrics_folder() as folder:
+        assert Path(folder).parent == tmp_path
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_killed_service_left_behind_is_removed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(metrics_folder_module, "MEMORY_FOLDER", str(tmp_path))
+    left, just_made, other = (tmp_path / f"viflow-metrics-{name}" for name in ("left", "made", "other"))
+    for folder in (left, just_made, other):
+        folder.mkdir()
+        (folder / "counter_1.db").touch()
+    for folder in (left, just_made):
+        (folder / "held").touch()
+    os.utime(left / "held", (1.0, 1.0))
+    with metrics_folder() as first:
+        os.utime(Path(first) / "held", (1.0, 1.0))
+        with metrics_folder() as second:  # another service on the machine
+            assert set(tmp_path.iterdir()) == {just_made, other, Path(first), Path(second)}
+
+
+HELD_BY_A_CHILD = """
+import os, sys
+from viflow_anomaly_service import metrics_folder
+
+metrics_folder.MEMORY_FOLDER = sys.argv[1]
+with metrics_folder.metrics_folder() as folder:
+    os.utime(os.path.join(folder, "held"), (1.0, 1.0))
+    if os.fork() == 0:
+        sys.stdin.read()
+    os._exit(0)
+"""
+
+
+def test_a_process_that_outlives_its_parent_keeps_its_numbers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(metrics_folder_module, "MEMORY_FOLDER", str(tmp_path))
+    command = [sys.executable, "-c", HELD_BY_A_CHILD, str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as parent:
+        assert parent.wait(60) == 0
+        (held,) = tmp_path.iterdir()
+        with metrics_folder():
+            assert held.exists()
+        assert parent.stdin is not None
+        assert parent.stdout is not None
+        parent.stdin.close()
+        parent.stdout.read()  # ends with the last process that holds it
+    with metrics_folder():
+        assert not held.exists()
 
 
 WISH = """
