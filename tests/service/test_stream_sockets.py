@@ -274,6 +274,7 @@ def no_faults(caplog: pytest.LogCaptureFixture) -> bool:
         (b"\0\0\0\x02{}", "opening_missing"),
         ("{", "json_invalid"),
         ('{"frame": {}}', "field_unknown"),
+        ('{"fx": 70, "fy": 70}', "field_unknown"),
         ('{"options": {"model": 1}}', "field_invalid"),
         ('{"camera": "' + "x" * 70_000 + '"}', "body_too_large"),
     ],
