@@ -25,7 +25,7 @@ export function addRegionsPanel(panel) {
     shown = key;
     reasons.replaceChildren(...detection.reasons.map((reason) => h("li", {}, h("strong", {}, reason.code.replaceAll("_", " ")), h("span", {}, reason.message))));
     list.replaceChildren(...detection.rois.map(roiItem));
-    if (!detection.rois.length) list.replaceChildren(h("li", { class: "quiet-note" }, detection.status === "abstained" ? "This pair cannot be judged: the reasons stand above." : "No regions: everything here is explained by the camera's own motion."));
+    if (!detection.rois.length) list.replaceChildren(h("li", { class: "quiet-note" }, detection.status === "abstained" ? "This pair cannot be judged: the first of the reasons above decided that." : "No regions: everything here is explained by the camera's own motion."));
     const roi = detection.rois.find((one) => one.id === state.roi);
     detail.replaceChildren(...(roi ? detailOf(pair, detection, roi, look) : hypothesesOf(look)));
     if (focused?.startsWith("roi-")) document.getElementById(focused)?.focus();
