@@ -38,7 +38,7 @@ EXIT_BAD_INPUT: Final = 2
 RESTART_SECONDS: Final = 1.0
 LOOK_SECONDS: Final = 0.2
 KILL_AFTER_SECONDS: Final = 15
-"""Beyond the time that a process takes to end in order: upload, farewell, workers that finish their pair."""
+"""Behind the time for requests and their farewell: ``closing_time.CLOSE_SECONDS``, and the interpreter's own end."""
 MEMORY_FOLDER: Final = "/dev/shm"  # noqa: S108 - the folder made in it is the process's own
 _PR_SET_PDEATHSIG: Final = 1
 
