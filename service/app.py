@@ -13,6 +13,7 @@ from fastapi import FastAPI
 from viflow_anomaly.pair_detector import PairDetector
 from viflow_anomaly_service.access_control import add_access_control
 from viflow_anomaly_service.admission import AdmissionGate
+from viflow_anomaly_service.closing_time import KEPT_FROM_EVENTS, KEPT_FROM_STORE, KEPT_FROM_WORKERS, ClosingTime
 from viflow_anomaly_service.dashboard.static_files import add_dashboard
 from viflow_anomaly_service.detect_endpoint import add_detect
 from viflow_anomaly_service.detector_loading import DetectorLoader, load_bundled_or_configured, warm_up
@@ -71,17 +72,18 @@ def create_app(
         if core.keeper is not None:
             core.keeper.start()
         core.events.start()
+        closing_time = ClosingTime()
         async with AsyncExitStack() as closing:  # from the last line to the first, each whatever the others do
             if tracing is not None:
-                closing.push_async_callback(end_tracing, tracing)
-            if core.keeper is not None:
-                closing.push_async_callback(core.keeper.close)
-            closing.push_async_callback(_close_events, core)
-            closing.push_async_callback(asyncio.to_thread, core.pool.close)
+                closing.push_async_callback(_end_tracing, tracing, closing_time)
+            closing.push_async_callback(_close_keeper, core, closing_time)
+            closing.push_async_callback(_close_events, core, closing_time)
+            closing.push_async_callback(_close_pool, core, closing_time)
             closing.push_async_callback(core.models.close)
             for task in tasks:
                 closing.callback(task.cancel)
             closing.callback(core.gate.close)
+            closing.callback(closing_time.begin)
             yield
 
     app = FastAPI(
@@ -154,8 +156,21 @@ def _build(
     )
 
 
-async def _close_events(core: ServiceCore) -> None:
-    await core.events.close(core.streams.begun())
+async def _close_pool(core: ServiceCore, time: ClosingTime) -> None:
+    await asyncio.to_thread(core.pool.close, time.left_s(kept_s=KEPT_FROM_WORKERS))
+
+
+async def _close_events(core: ServiceCore, time: ClosingTime) -> None:
+    await core.events.close(core.streams.begun(), within_s=time.left_s(kept_s=KEPT_FROM_EVENTS))
+
+
+async def _close_keeper(core: ServiceCore, time: ClosingTime) -> None:
+    if core.keeper is not None:
+        await core.keeper.close(within_s=time.left_s(kept_s=KEPT_FROM_STORE))
+
+
+async def _end_tracing(provider: Any, time: ClosingTime) -> None:
+    await end_tracing(provider, within_s=time.left_s())
 
 
 async def _watch_memory(metrics: ServiceMetrics) -> None:

@@ -40,6 +40,8 @@ _FORM_NAMES: Final = {
 }
 _JSON_NAMES: Final = {"source.image": "source.image_base64", "target.image": "target.image_base64"}
 
+_LENS: Final = ("fx", "fy", "cx", "cy")
+
 Wire = TypeVar("Wire", bound=WireModel)
 
 
@@ -128,15 +130,15 @@ def read_form(body: bytes, content_type: str, settings: ServiceSettings) -> Rece
             detail = f"expected a part {name}, found {', '.join(sorted(parts)) or 'none'}"
             raise Problem(422, code="field_missing", detail=detail, field=name)
 
-    def from_json(shape: type[Wire], name: str, data: bytes) -> Wire:
-        return validated(shape, parse_json(data, max_values=settings.max_json_values, part=name), name)
+    def from_json(name: str) -> Any:
+        return parse_json(parts.get(name, b"{}"), max_values=settings.max_json_values, part=name)
 
-    imu = from_json(StampedImuPart, "imu", parts["imu"])
+    imu = validated(StampedImuPart, from_json("imu"), "imu")
     return ReceivedPair(
         images={"source": parts["source"], "target": parts["target"]},
         timestamps_ns={"source": imu.source_timestamp_ns, "target": imu.target_timestamp_ns},
         imu=imu,
-        rest=from_json(RequestRest, "request", parts.get("request", b"{}")),
+        rest=validated_around_camera(RequestRest, from_json("request"), "request"),
         field_names=_FORM_NAMES,
         options_place="request.options",
     )
@@ -212,6 +214,21 @@ def validated(shape: type[Wire], value: Any, prefix: str | None = None) -> Wire:
         return shape.model_validate(value)
     except ValidationError as err:
         raise problem_of_validation(err, prefix) from err
+
+
+def validated_around_camera(shape: type[Wire], value: Any, prefix: str | None = None) -> Wire:
+    """``validated`` for a shape with a member ``camera``; a camera in its place, which is a file that people have, is
+    told in one sentence.
+
+    Raises:
+        Problem: 422 with the fields at fault, below ``prefix``.
+    """
+    if isinstance(value, dict) and "camera" not in value and (bare := [name for name in _LENS if name in value]):
+        place = f"{prefix}: " if prefix else ""
+        detail = f'{place}expected an object around the camera, {{"camera": {{"fx": ..., "fy": ..., "cx": ..., "cy": '
+        detail += f'..., "width": ..., "height": ...}}}}, found the camera itself ({", ".join(bare)})'
+        raise Problem(422, code="field_unknown", detail=detail, field=prefix)
+    return validated(shape, value, prefix)
 
 
 def from_base64(text: str, field: str) -> bytes:

@@ -21,7 +21,6 @@ from viflow_anomaly_service.metrics import ServiceMetrics
 logger = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
-JOIN_SECONDS: Final = 10.0
 MEET_SECONDS: Final = 60.0
 
 
@@ -148,12 +147,12 @@ class DetectorPool:
         finally:
             together.abort()  # whoever waits for one that will not come
 
-    def close(self) -> None:
-        """Let the workers finish what they do, and wait for them, though not for ever."""
+    def close(self, within_s: float) -> None:
+        """Let the workers finish what they do, and wait for them, but not longer."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        deadline = time.monotonic() + JOIN_SECONDS
+        deadline = time.monotonic() + within_s
         for thread in self._threads:
             thread.join(max(0.0, deadline - time.monotonic()))
         if stuck := [thread.name for thread in self._threads if thread.is_alive()]:

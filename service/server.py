@@ -8,6 +8,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import uvicorn
@@ -45,7 +47,8 @@ def run(settings: ServiceSettings, *, load_detector: DetectorLoader | None = Non
 
     Raises:
         ConfigError: ``keys_missing``, ``address_unavailable``, ``workers_unsupported``, ``workers_failed``; the key
-            file cannot be used.
+            file, or another setting (see ``create_app``), cannot be used.
+        MissingDependencyError: a setting asks for an extra that is not installed.
         Exception: what ``load_detector`` raised (``CheckpointError`` for a checkpoint that cannot be used); the
             server has ended by then.
     """
@@ -63,17 +66,26 @@ def run(settings: ServiceSettings, *, load_detector: DetectorLoader | None = Non
 
             supervise(settings, load_detector, stop)
         else:
-            with bind(settings.host, settings.port) as listener:
-                log_address(listener, workers=1)
-                serve(settings, listener, load_detector, stop)
+            serve(settings, load_detector, stop, on_listening=partial(log_address, workers=1))
     finally:
         stop.restore()
 
 
 def serve(
-    settings: ServiceSettings, listener: socket.socket, load_detector: DetectorLoader | None, stop: StopSignals
+    settings: ServiceSettings,
+    load_detector: DetectorLoader | None,
+    stop: StopSignals,
+    *,
+    on_listening: Callable[[socket.socket], None],
+    shared: bool = False,
 ) -> None:
-    """Serve in this process, on a socket that listens; raises what ``load_detector`` raised."""
+    """Serve in this process; raises as ``run``.
+
+    Args:
+        on_listening: told of the socket once what comes there is answered, which is never the case where the settings
+            cannot be used.
+        shared: as for ``bind``.
+    """
     from viflow_anomaly_service.app import create_app  # noqa: PLC0415 - imports prometheus-client
     from viflow_anomaly_service.detector_loading import load_bundled_or_configured  # noqa: PLC0415
 
@@ -95,9 +107,15 @@ def serve(
         backlog=BACKLOG,
         timeout_graceful_shutdown=settings.shutdown_timeout_s + FAREWELL_SECONDS,
     )
-    server = GracefulServer(config, gate=app.state.core.gate, patience_s=settings.shutdown_timeout_s)
+    server = GracefulServer(
+        config,
+        gate=app.state.core.gate,
+        patience_s=settings.shutdown_timeout_s,
+        on_listening=lambda: on_listening(listener),
+    )
     stop.tell(server)
-    server.run(sockets=[listener])
+    with bind(settings.host, settings.port, shared=shared) as listener:
+        server.run(sockets=[listener])
     if failures:
         raise failures[0]
 
@@ -108,12 +126,25 @@ class GracefulServer(uvicorn.Server):
     Args:
         gate: closed as soon as the server is to end.
         patience_s: for what is inside then.
+        on_listening: called once connections are answered.
     """
 
-    def __init__(self, config: uvicorn.Config, *, gate: AdmissionGate, patience_s: float) -> None:
+    def __init__(
+        self,
+        config: uvicorn.Config,
+        *,
+        gate: AdmissionGate,
+        patience_s: float,
+        on_listening: Callable[[], None] = lambda: None,
+    ) -> None:
         super().__init__(config)
         self._gate = gate
         self._patience_s = patience_s
+        self._on_listening = on_listening
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        self._on_listening()
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self._gate.close()

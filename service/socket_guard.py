@@ -9,7 +9,9 @@ import sys
 from http import HTTPStatus
 from typing import Any, Final
 
+from uvicorn.protocols.utils import ClientDisconnected
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.frames import CloseCode
 
 from viflow_anomaly_service.connection_guard import LINGER_SECONDS
 from viflow_anomaly_service.settings import ServiceSettings
@@ -41,6 +43,7 @@ class GuardedSocket(WebSocketsSansIOProtocol):
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._left = asyncio.Event()
+        self._unreadable = False
         self._hangup: HangupWatch | None = None
         # Its own lines show query strings, and headers in debug; ours are in the request log.
         self.logger = _FaultsOnly(self.logger)  # type: ignore[assignment]
@@ -66,6 +69,21 @@ class GuardedSocket(WebSocketsSansIOProtocol):
         else:
             super().handle_cont(event)
 
+    def send_receive_event_to_app(self) -> None:
+        """Text that is not UTF-8 is the peer's mistake: closed, and not logged with a traceback as uvicorn does."""
+        if self.curr_msg_data_type == "text" and not self.close_sent and not _is_utf8(b"".join(self.frames)):
+            self.frames = []
+            self.conn.send_close(CloseCode.INVALID_DATA)
+            self.handle_parser_exception()
+            return
+        super().send_receive_event_to_app()
+
+    def handle_parser_exception(self) -> None:
+        """What cannot be read ends the connection; a message at work is not answered any more."""
+        self._unreadable = True
+        self._left.set()
+        super().handle_parser_exception()
+
     def handle_close(self, event: Any) -> None:
         self._left.set()
         super().handle_close(event)
@@ -81,6 +99,8 @@ class GuardedSocket(WebSocketsSansIOProtocol):
         self.loop.call_later(self.close_timeout + LINGER_SECONDS, self.transport.abort)
 
     async def send(self, message: Any) -> None:
+        if self._unreadable:
+            raise ClientDisconnected  # uvicorn calls it a fault of ours until the transport is closed, too
         await super().send(message)
         if message["type"] == "websocket.http.response.body" and self.close_sent:
             self.handshake_complete = True  # or it would log the refusal, which is whole, as a fault of ours
@@ -93,6 +113,14 @@ class GuardedSocket(WebSocketsSansIOProtocol):
     def keepalive_timeout(self) -> None:
         super().keepalive_timeout()
         self.loop.call_later(LINGER_SECONDS, self.transport.abort)
+
+
+def _is_utf8(data: bytes) -> bool:
+    try:
+        data.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 class HangupWatch:

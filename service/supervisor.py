@@ -17,6 +17,9 @@ import signal
 import socket
 import sys
 import time
+from collections.abc import Callable
+from functools import partial
+from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING, Final
 
@@ -34,7 +37,7 @@ EXIT_BAD_INPUT: Final = 2
 RESTART_SECONDS: Final = 1.0
 LOOK_SECONDS: Final = 0.2
 KILL_AFTER_SECONDS: Final = 15
-"""Beyond the time that a process takes to end in order: upload, farewell, workers that finish their pair."""
+"""Behind the time for requests and their farewell: ``closing_time.CLOSE_SECONDS``, and the interpreter's own end."""
 _PR_SET_PDEATHSIG: Final = 1
 
 
@@ -61,7 +64,7 @@ def supervise(settings: ServiceSettings, load_detector: DetectorLoader | None, s
     ):
         reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         reserved.bind((host, port))  # holds the address while processes come and go; it does not listen
-        log_address(reserved, workers=settings.workers)
+        on_listening = partial(log_address, reserved, workers=settings.workers)
         settings = settings.model_copy(update={"host": host, "port": port})
         if "prometheus_client" in sys.modules:
             raise AssertionError(
@@ -76,18 +79,32 @@ def supervise(settings: ServiceSettings, load_detector: DetectorLoader | None, s
 
         gc.collect()
         gc.freeze()  # a collection in a process would else copy every page it looks at
-        Supervisor(settings, load_detector, stop).run()
+        Supervisor(settings, load_detector, stop, on_listening=on_listening).run()
 
 
 class Supervisor:
-    """The loop of the parent: starts processes, replaces those that die, ends them all."""
+    """The loop of the parent: starts processes, replaces those that die, ends them all.
 
-    def __init__(self, settings: ServiceSettings, load_detector: DetectorLoader | None, stop: StopSignals) -> None:
+    Args:
+        on_listening: called when the first of the processes answers connections.
+    """
+
+    def __init__(
+        self,
+        settings: ServiceSettings,
+        load_detector: DetectorLoader | None,
+        stop: StopSignals,
+        *,
+        on_listening: Callable[[], None] = lambda: None,
+    ) -> None:
         self._settings = settings
         self._load_detector = load_detector
         self._context = multiprocessing.get_context("fork")
         self._processes: list[BaseProcess] = []
         self._stop = stop
+        self._on_listening = on_listening
+        self._told_listening = False
+        self._heard, self._tell = self._context.Pipe(duplex=False)
 
     def run(self) -> None:
         """Until it is to end; raises as ``supervise``."""
@@ -95,7 +112,9 @@ class Supervisor:
         while not self._stop.requested and not failed:
             while len(self._processes) < self._settings.workers and not self._stop.requested:
                 self._start()
-            multiprocessing.connection.wait([process.sentinel for process in self._processes], timeout=LOOK_SECONDS)
+            sentinels = [process.sentinel for process in self._processes]
+            multiprocessing.connection.wait([*sentinels, self._heard], timeout=LOOK_SECONDS)
+            self._hear()
             failed = self._bury()
         ended = self._end()
         if failed or not ended:
@@ -108,11 +127,21 @@ class Supervisor:
 
     def _start(self) -> None:
         process = self._context.Process(
-            target=_serve_in_child, args=(self._settings, self._load_detector, os.getpid()), name="viflow-worker"
+            target=_serve_in_child,
+            args=(self._settings, self._load_detector, os.getpid(), self._tell),
+            name="viflow-worker",
         )
         process.start()
         self._processes.append(process)
         logger.info("worker_started", extra={"worker": process.pid})
+
+    def _hear(self) -> None:
+        """Take what the processes tell, also when it is no news: a pipe that is full would hold them up."""
+        while self._heard.poll():
+            self._heard.recv_bytes()
+            if not self._told_listening:
+                self._told_listening = True
+                self._on_listening()
 
     def _bury(self) -> bool:
         """Forget the dead; True: one of them ended for a reason that its successor would end for, too."""
@@ -145,13 +174,14 @@ class Supervisor:
         return not stuck
 
 
-def _serve_in_child(settings: ServiceSettings, load_detector: DetectorLoader | None, parent: int) -> None:
+def _serve_in_child(
+    settings: ServiceSettings, load_detector: DetectorLoader | None, parent: int, tell: Connection
+) -> None:
     stop = StopSignals()
     stop.install()
     _end_with(parent)
     try:
-        with bind(settings.host, settings.port, shared=True) as listener:
-            serve(settings, listener, load_detector, stop)
+        serve(settings, load_detector, stop, on_listening=lambda listener: tell.send_bytes(b"."), shared=True)
     except ViflowError as err:
         sys.stderr.write(f"error: {' '.join(err.message.split())} [{err.code}]\n")
         sys.exit(EXIT_BAD_INPUT)

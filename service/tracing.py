@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import threading
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
@@ -61,9 +62,13 @@ def otlp_exporter() -> SpanExporter:
     return OTLPSpanExporter()
 
 
-async def end_tracing(provider: TracerProvider) -> None:
-    """Send what is left; a collector that is gone costs the exporter's own patience at most."""
-    await asyncio.to_thread(provider.shutdown)
+async def end_tracing(provider: TracerProvider, *, within_s: float) -> None:
+    """Send what is left; a collector that does not take it in time gets no more, and the process does not wait."""
+    ending = threading.Thread(target=provider.shutdown, name="traces-end", daemon=True)
+    ending.start()
+    await asyncio.to_thread(ending.join, within_s)
+    if ending.is_alive():
+        logger.warning("traces_not_sent_in_time")
 
 
 class TracingMiddleware:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from viflow_anomaly.checkpoint_record import CheckpointRecord
 from viflow_anomaly.config import CorrectionConfig, DetectorConfig, ModelConfig, QualityConfig
 from viflow_anomaly.correction import Correction, RigidMotion
-from viflow_anomaly.detection import Detection
+from viflow_anomaly.detection import Detection, Reason
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.geometry import Float32Array, so3_exp
 from viflow_anomaly.imu_units import ImuFault
@@ -27,6 +27,7 @@ from viflow_anomaly.pair_quality import (
     judge_correction,
     judge_images,
     judge_window,
+    reasons_in_order,
     sharpness,
     sharpness_ratio,
 )
@@ -365,3 +366,16 @@ class TestDetector:
     def test_a_jump_beyond_compensation_abstains(self) -> None:
         detection = judged(texture(0), developed(texture(0), 0.35), (0.0, 0.0, 0.0))
         assert (detection.status, self.codes(detection)) == ("abstained", ["exposure_jump"])
+
+    def test_what_forbids_to_judge_a_pair_is_told_first(self) -> None:
+        brighter = developed(defocused(texture(0), 5.0), 1.1, 30)
+        assert of_images(texture(0), brighter) == {"exposure_jump": False, "blur": True}
+        detection = judged(texture(0), brighter, (0.0, 0.0, 0.0))
+        assert (detection.status, self.codes(detection)) == ("abstained", ["blur", "exposure_jump"])
+
+
+def test_reasons_keep_their_order_but_for_those_that_decide() -> None:
+    decides = (False, True, False, True)
+    findings = [Finding(Reason(f"r{k}", "..."), abstain) for k, abstain in enumerate(decides)]
+    assert [one.code for one in reasons_in_order(findings)] == ["r1", "r3", "r0", "r2"]
+    assert reasons_in_order(()) == ()

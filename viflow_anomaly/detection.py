@@ -114,7 +114,7 @@ class Detection:
 
     Attributes:
         status: ``abstained`` when the pair cannot be judged; ``rois`` is then empty.
-        reasons: why it abstained, or what lowers trust.
+        reasons: what lowers trust; of an abstained pair, what forbids to judge it comes first.
         rois: highest score first, ties by y then x.
         residual: None when the pair was given up before a residual existed (only when abstained).
         timings_ms: by stage; ``decode``, ``inference``, ``regions`` and ``total`` are always written (0 when absent).

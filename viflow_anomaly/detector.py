@@ -39,7 +39,7 @@ from viflow_anomaly.motion_evidence import (
 )
 from viflow_anomaly.motion_input import MotionWindow
 from viflow_anomaly.pair_detector import Execution, LoadedWeights
-from viflow_anomaly.pair_quality import Finding, judge_correction, judge_images, judge_window
+from viflow_anomaly.pair_quality import Finding, judge_correction, judge_images, judge_window, reasons_in_order
 from viflow_anomaly.prediction import PredictedFlow, predict_flow
 from viflow_anomaly.regions import BoundingBox
 from viflow_anomaly.runtime.interface import Runtime
@@ -228,7 +228,7 @@ class AnomalyDetector:
             target_timestamp_ns=pair.target.timestamp_ns,
             image=image,
             status="abstained" if abstained else "ok",
-            reasons=tuple(finding.reason for finding in findings),
+            reasons=reasons_in_order(findings),
             model=self.model_info,
             rois=rois,
             region_analyzed=AnalyzedRegion(**analyzed._asdict()),

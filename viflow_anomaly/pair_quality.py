@@ -7,6 +7,7 @@ of the motion found (do the images confirm any motion of the camera, and is it t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -111,6 +112,12 @@ def judge_correction(
         confidence = float(measured.confidence.mean())
         findings += _imu_contradicts_image(correction, confidence, interval_s, config)
     return tuple(findings)
+
+
+def reasons_in_order(findings: Sequence[Finding]) -> tuple[Reason, ...]:
+    """What forbids to judge the pair ahead of what is only remarked, so that an abstained pair's first reason decided;
+    both in the order in which they were found."""
+    return tuple(one.reason for one in sorted(findings, key=lambda one: not one.abstain))
 
 
 def sharpness(image: Uint8Array) -> Sharpness:

@@ -37,7 +37,8 @@ logger = logging.getLogger(__name__)
 
 LOOK_SECONDS: Final = 1.0
 CLOSE_SECONDS: Final = 4.0
-"""For all that events need before the service stops; the store, which may hang, is closed after that."""
+"""For all that events need before the service stops, if there is as much; the store, which may hang, is closed after
+that."""
 ENDS_SECONDS: Final = 2.0
 """Of these, for the ends of what is open to be kept; what does not come through is ended by the next process."""
 TOLD_SECONDS: Final = 3.0
@@ -105,16 +106,18 @@ class EventParts:
             self._courier_tasks = [asyncio.create_task(courier.run()) for courier in stored.couriers]
         self._tasks = [asyncio.create_task(one) for one in work]
 
-    async def close(self, streams: Sequence[LiveStream]) -> None:
-        """After the last request, before the store is closed; takes ``CLOSE_SECONDS`` at most."""
+    async def close(self, streams: Sequence[LiveStream], *, within_s: float) -> None:
+        """After the last request, before the store is closed; takes ``CLOSE_SECONDS`` at most, each step its share of
+        what there is."""
         began = asyncio.get_running_loop().time()
+        share = min(1.0, within_s / CLOSE_SECONDS)
         couriers = self.stored.couriers if self.stored is not None else ()
         try:
-            async with asyncio.timeout_at(began + CLOSE_SECONDS):
+            async with asyncio.timeout_at(began + share * CLOSE_SECONDS):
                 await _ended(self._tasks)
-                await self.desk.close(streams, until=began + ENDS_SECONDS)
+                await self.desk.close(streams, until=began + share * ENDS_SECONDS)
                 with contextlib.suppress(Problem, TimeoutError):  # what is left waits in the store for the next process
-                    async with asyncio.timeout_at(began + TOLD_SECONDS):
+                    async with asyncio.timeout_at(began + share * TOLD_SECONDS):
                         await asyncio.gather(*(courier.settle() for courier in couriers))
                 await _ended(self._courier_tasks)
                 for courier in couriers:

@@ -33,6 +33,7 @@ from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.request_body import RequestBody, answered
 from viflow_anomaly_service.service_core import ServiceCore
 from viflow_anomaly_service.stage_times import StageClock
+from viflow_anomaly_service.streams.calls import require_stream_id
 
 MAX_TUNE_BYTES: Final = 64 * 1024
 
@@ -151,6 +152,8 @@ def _overview(
 
 def _followed(core: ServiceCore, request: Request, stream_id: str | None) -> Response:
     _require_memory(core)
+    if stream_id is not None and stream_id != UPLOADS:
+        require_stream_id(stream_id)  # one that has not begun yet is waited for
     core.gate.require_open()
     memory = core.live
     after = resume_after(request, memory.newest_number)

@@ -80,7 +80,7 @@ _INSPECTED: Final[JsonObject] = {
             "errors": {
                 "type": "array",
                 "items": _NUMBER_OR_NULL,
-                "description": "of the rebuilt source, smaller is better",
+                "description": "of the rebuilt source, in standard deviations of its brightness; smaller is better",
             },
             "winner": {**_COUNT, "description": "index of the chosen one"},
             "corrected_error": {**_NUMBER_OR_NULL, "description": "of the flow after the correction"},

@@ -22,6 +22,7 @@ HELLO: Final = b"retry: 1000\n: following\n\n"
 def resume_after(request: Request, newest: int) -> int:
     """The number a client has last seen: header ``Last-Event-ID``, or parameter ``after``; else the newest.
 
+    An empty header is none: so the standard of server-sent events says that nothing was seen yet.
     One that is still to come is of a process whose clock was ahead: such a client is told everything.
 
     Raises:
@@ -31,7 +32,7 @@ def resume_after(request: Request, newest: int) -> int:
         if name != "after":
             raise Problem(422, code="parameter_unknown", detail=f"expected after, found {name!r:.80}", field=name[:80])
     place, text = "Last-Event-ID", request.headers.get("last-event-id")
-    if text is None:
+    if not text:
         place, text = "after", request.query_params.get("after")
     if text is None:
         return newest

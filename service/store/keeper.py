@@ -6,7 +6,6 @@ import asyncio
 import logging
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Final, TypeVar
 
@@ -22,6 +21,7 @@ from viflow_anomaly_service.store.detection_store import DetectionStore
 from viflow_anomaly_service.store.failures import StoreError, store_error
 from viflow_anomaly_service.store.query import DetectionFilter, PageRequest, cursor_of
 from viflow_anomaly_service.store.record import IdMaker, Record, StoredDetection, record_of
+from viflow_anomaly_service.store.store_threads import StoreThreads
 
 logger = logging.getLogger(__name__)
 
@@ -75,8 +75,8 @@ class ResultKeeper:
         self._failure: StoreError | None = store_error("store_opening")
         self._waiting: list[tuple[list[Record], Along | None, asyncio.Future[None]]] = []
         self._committing: asyncio.Task[None] | None = None
-        self._writer = ThreadPoolExecutor(1, thread_name_prefix="store-write")
-        self._readers = ThreadPoolExecutor(READERS, thread_name_prefix="store-read")
+        self._writer = StoreThreads(1, "store-write")
+        self._readers = StoreThreads(READERS, "store-read")
         self._tasks: list[asyncio.Task[None]] = []
 
     @property
@@ -88,16 +88,22 @@ class ResultKeeper:
         """Open the store, and look after it; a store that cannot be opened is tried again later."""
         self._tasks = [asyncio.create_task(self._watch()), asyncio.create_task(self._prune_now_and_then())]
 
-    async def close(self) -> None:
-        """After the last request."""
+    async def close(self, *, within_s: float) -> None:
+        """After the last request; a store that hangs for longer is left as it is, as if the process had been killed."""
         for task in self._tasks:
             task.cancel()
-        if self._committing is not None:
-            await self._committing
-        await asyncio.to_thread(self._shut_down)
+        try:
+            async with asyncio.timeout(within_s):
+                if self._committing is not None:
+                    await self._committing
+                await asyncio.get_running_loop().run_in_executor(self._writer, self._shut_down)
+        except TimeoutError:
+            logger.error("store_not_closed_in_time", extra={"store": self._store.place})  # noqa: TRY400 - says it all
+        finally:
+            self._writer.shutdown(wait=False, cancel_futures=True)
 
     def _shut_down(self) -> None:
-        self._writer.shutdown()
+        """The writer's last call, behind all others."""
         self._readers.shutdown(cancel_futures=True)
         self._store.close()
 

@@ -35,10 +35,19 @@ def require_callable(core: ServiceCore, stream_id: str) -> ModelSet:
         Problem: 422 ``stream_id_invalid``, 501, 503.
     """
     require_one_process(core)
+    require_stream_id(stream_id)
+    return core.require_judging()
+
+
+def require_stream_id(stream_id: str) -> None:
+    """Nothing, if a stream can have this name.
+
+    Raises:
+        Problem: 422 ``stream_id_invalid``.
+    """
     if STREAM_ID.fullmatch(stream_id) is None:
         detail = f"stream_id: expected 1 to 64 of A-Z a-z 0-9 . _ -, found {stream_id!r:.80}"
         raise Problem(422, code="stream_id_invalid", detail=detail, field="stream_id")
-    return core.require_judging()
 
 
 async def answer_call(

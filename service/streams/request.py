@@ -9,7 +9,7 @@ from typing import Any, Final
 from viflow_anomaly.errors import InvalidInputError, ViflowError
 from viflow_anomaly.images import decode_image
 from viflow_anomaly.sensor_data import Frame, ImuSamples
-from viflow_anomaly_service.detection_request import from_base64, imu_samples, validated
+from viflow_anomaly_service.detection_request import from_base64, imu_samples, validated, validated_around_camera
 from viflow_anomaly_service.form_body import parse_form
 from viflow_anomaly_service.json_body import parse_json
 from viflow_anomaly_service.problems import Problem, problem_of_error
@@ -115,7 +115,7 @@ def _from_form(body: bytes, content_type: str, settings: ServiceSettings) -> _Pa
         return parse_json(parts.get(name, b"{}"), max_values=settings.max_json_values, part=name)
 
     imu = validated(StampedStreamSamples, json_part("imu"), "imu")
-    setup = validated(StreamSetup, json_part("request"), "request")
+    setup = validated_around_camera(StreamSetup, json_part("request"), "request")
     image = parts.get("frame")
     if (image is None) != (imu.frame_timestamp_ns is None):
         missing = "frame" if image is None else "imu.frame_timestamp_ns"

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final, NamedTuple
 
 from pydantic import Field
 
-from viflow_anomaly_service.detection_request import from_base64, validated
+from viflow_anomaly_service.detection_request import from_base64, validated, validated_around_camera
 from viflow_anomaly_service.json_body import parse_json
 from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.schemas import ImagePart, TimestampNs, WireModel
@@ -69,7 +69,7 @@ def read_opening(message: str | bytes, settings: ServiceSettings) -> SocketOpeni
     if len(data) > MAX_OPENING_BYTES:
         detail = f"expected an opening message of at most {MAX_OPENING_BYTES} bytes, found {len(data)}"
         raise Problem(413, code="body_too_large", detail=detail)
-    return validated(SocketOpening, parse_json(data, max_values=settings.max_json_values))
+    return validated_around_camera(SocketOpening, parse_json(data, max_values=settings.max_json_values))
 
 
 class MessageReading:

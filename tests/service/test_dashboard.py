@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from dashboard_page import held_still, needs_chromium, running_browser, shot, watched_page
 from looking_on import RealService, feed, free_port, real_service, sample_calls, sample_pair
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 from rule_detector import RuleDetector
 from service_world import live_server
 
@@ -69,6 +69,7 @@ def test_an_uploaded_pair_is_drawn_with_its_regions(service: RealService, browse
         expect(page.locator("#picture .roi.motion .line")).to_have_count(1)
         expect(page.get_by_text("guesses of the camera's motion")).to_be_visible()
         expect(page.locator(".bars li")).to_have_count(9)
+        expect(page.locator(".bars .score").first).to_have_text(re.compile(r"^\d\.\d{3} \u03c3$"))
         held_still(page)
         page.locator("#show-arrows").check()
         expect(page.locator("#picture .flow-line").nth(100)).to_be_attached()
@@ -286,9 +287,9 @@ def test_recorded_events_stand_on_the_timeline(browser: Browser, tmp_path: Path)
         feed(client)
         pairs = client.get("/streams/drone7/pairs").json()["pairs"][::-1]
         stamps = [pair["detection"]["source_timestamp_ns"] for pair in pairs]
-        thing = {"thing_id": "a-1", "stream_id": "drone7", "track_id": 1, "started_at_ns": stamps[1], "score": 0.9}
+        thing = {"thing_id": "a-1", "stream_id": "drone7", "track_id": 1, "started_at_ns": stamps[0], "score": 0.9}
         end = {**thing, "event_id": "2", "kind": "end", "timestamp_ns": stamps[6], "reason": "left", "top_score": 0.97}
-        start = {**thing, "event_id": "1", "kind": "start", "timestamp_ns": stamps[1], "reason": None}
+        start = {**thing, "event_id": "1", "kind": "start", "timestamp_ns": stamps[0], "reason": None}
         with watched_page(browser, storing.address) as page:
             page.get_by_role("tab", name="Events").click()
             expect(page.get_by_role("tabpanel")).to_contain_text(re.compile("Stored detections|Recorded events"))
@@ -298,12 +299,42 @@ def test_recorded_events_stand_on_the_timeline(browser: Browser, tmp_path: Path)
             page.route("**/events?stream=drone7*", lambda route: route.fulfill(json={"events": [end, start]}))
             page.reload()
             page.get_by_role("tab", name="Events").click()
-            item = page.get_by_role("button", name=re.compile("Track 1 0.25 s, left 0.97"))
+            item = page.get_by_role("button", name=re.compile("Track 1 0.30 s, left 0.97"))
             item.click()
             expect(page.locator("#scrub-told")).to_have_text(re.compile("pair 7 of 9"))
             expect(page.locator(".thing.began")).to_have_count(1)
             expect(page.locator(".thing.ended")).to_have_count(1)
             shot(page, "events", tmp_path)
+            assert uncut(page, ".thing.began")
+
+
+def uncut(page: Page, selector: str) -> bool:
+    """Whether it stands clear of the timeline's left edge, which is round."""
+    # In one go: the timeline is drawn anew with every answer.
+    left = "one => document.querySelector(one).getBoundingClientRect().left"
+    difference = page.evaluate(f"one => ({left})(one) - ({left})('.timeline-picture')", selector)
+    return bool(difference >= 3)
+
+
+def test_a_rate_of_alarms_needs_a_minute_of_footage(service: RealService, browser: Browser) -> None:
+    def longer(route: Route) -> None:
+        told = route.fetch().json()
+        for stream in told["streams"]:
+            stream.update(footage_s=60.0, alarms_per_hour=540.0)
+        route.fulfill(json=told)
+
+    with watched_page(browser, service.address) as page:
+        open_drone7(page)
+        page.get_by_role("tab", name="Alarms").click()
+        item = page.locator(".rate").filter(has_text="drone7")
+        expect(item).to_contain_text("less than 1 minute of footage")
+        expect(item.locator(".score")).to_have_text("\u2013")
+        expect(item.locator(".rate-bar")).to_have_count(0)
+        page.route("**/live", longer)
+        page.reload()
+        page.get_by_role("tab", name="Alarms").click()
+        expect(item.locator(".score")).to_have_text("540/h")
+        expect(item.locator(".rate-bar")).to_have_count(1)
 
 
 def test_what_the_service_says_is_never_taken_for_markup(browser: Browser) -> None:

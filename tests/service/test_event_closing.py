@@ -72,7 +72,7 @@ def test_a_database_that_hangs_does_not_hold_up_the_end(monkeypatch: pytest.Monk
 
     async def close() -> None:
         async with asyncio.timeout(30):
-            await parts(cast("Any", hanging), [hanging]).close([begun_stream()])
+            await parts(cast("Any", hanging), [hanging]).close([begun_stream()], within_s=30.0)
 
     asyncio.run(close())
     assert hanging.asked == ["end", "settle", "release"]
@@ -90,7 +90,7 @@ def test_ends_that_fail_keep_nothing_else_from_being_closed() -> None:
     hanging = Hanging()
 
     async def close() -> None:
-        released = asyncio.create_task(parts(Failing(9), [hanging]).close([begun_stream()]))
+        released = asyncio.create_task(parts(Failing(9), [hanging]).close([begun_stream()], within_s=30.0))
         while not hanging.asked and not released.done():
             await asyncio.sleep(0)
         released.cancel()
@@ -104,11 +104,11 @@ def test_the_store_is_closed_though_events_fail(tmp_path: Path, monkeypatch: pyt
     closed: list[str] = []
     close_keeper = ResultKeeper.close
 
-    async def fail(self: EventParts, streams: Any) -> None:
+    async def fail(self: EventParts, streams: Any, *, within_s: float) -> None:
         raise FaultError
 
-    async def close(self: ResultKeeper) -> None:
-        await close_keeper(self)
+    async def close(self: ResultKeeper, *, within_s: float) -> None:
+        await close_keeper(self, within_s=within_s)
         closed.append("store")
 
     monkeypatch.setattr(EventParts, "close", fail)

@@ -302,6 +302,14 @@ def test_a_wrong_last_id_is_refused(storing: LiveServer, text: str) -> None:
     assert_problem(answer, 422, "parameter_invalid", "Last-Event-ID")
 
 
+def test_an_empty_last_id_is_none(telling: LiveServer) -> None:
+    play(telling.client, "before", ONE_EVENT)
+    with reading(url(telling), last_event_id="") as stream:
+        play(telling.client, "behind", ONE_EVENT)
+        wait_until(lambda: len(stream.messages) == 3)
+    assert {event["stream_id"] for _, _, event in stream.messages} == {"behind"}
+
+
 def test_a_cursor_of_other_filters_is_refused(storing: LiveServer) -> None:
     play(storing.client, "hall", ONE_EVENT)
     cursor = listed(storing, limit=1)["next_cursor"]

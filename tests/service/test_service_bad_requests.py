@@ -279,6 +279,20 @@ def test_form_without_stamps(server: LiveServer) -> None:
     ]
 
 
+def test_a_camera_without_its_envelope_is_told_in_one_sentence(server: LiveServer) -> None:
+    form = form_request(request=("camera.json", json.dumps(camera_part() | {"T_cam_imu": None}), "application/json"))
+    response = server.post_form(form)
+    assert_problem(response, 422, "field_unknown", "request")
+    told = response.json()
+    assert "errors" not in told
+    assert told["detail"] == (
+        'request: expected an object around the camera, {"camera": {"fx": ..., "fy": ..., "cx": ..., "cy": ..., '
+        '"width": ..., "height": ...}}, found the camera itself (fx, fy, cx, cy)'
+    )
+    both = form_request(request=(None, json.dumps({"camera": camera_part(), "fx": 70.0})))
+    assert_problem(server.post_form(both), 422, "field_unknown", "request.fx")
+
+
 def test_unknown_part(server: LiveServer) -> None:
     form = form_request(sauce=("s.png", GOOD_PNG, "image/png"))
     assert_problem(server.post_form(form), 422, "field_unknown", "sauce")

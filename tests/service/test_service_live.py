@@ -252,6 +252,26 @@ def test_parameters_of_events_are_checked(real: LiveServer) -> None:
     assert answer.json()["detail"].startswith("Last-Event-ID: ")
 
 
+def test_an_empty_last_event_id_is_none(real: LiveServer) -> None:
+    numbers = sorted(pair["number"] for pair in pairs_of(real))
+    with real.client.stream("GET", f"/live/pairs?after={numbers[0]}", headers={"Last-Event-ID": ""}) as answer:
+        assert answer.status_code == 200
+        assert events_of(answer.iter_lines(), 1)[0][0] == numbers[1]
+    assert_problem(real.client.get("/live/pairs?after="), 422, "parameter_invalid", "after")
+
+
+@pytest.mark.parametrize("name", ["a%20b", "..%00", "~other", "x" * 65, "%C3%A4"])
+def test_nobody_follows_a_name_that_no_stream_can_have(real: LiveServer, name: str) -> None:
+    assert_problem(real.client.get(f"/streams/{name}/live"), 422, "stream_id_invalid", "stream_id")
+
+
+@pytest.mark.parametrize("name", ["not.begun-yet", UPLOADS])
+def test_what_is_still_to_come_can_be_followed(real: LiveServer, name: str) -> None:
+    with real.client.stream("GET", f"/streams/{name}/live") as answer:
+        assert answer.status_code == 200
+        assert next(answer.iter_lines()).startswith("retry:")
+
+
 def test_the_detector_is_described(real: LiveServer) -> None:
     told = real.client.get("/detector").json()
     assert told["configuration"]["regions"]["shape_rule"] == "axis_aligned"

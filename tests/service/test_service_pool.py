@@ -55,7 +55,7 @@ def in_hall(scene: Callable[[Hall], object], *, workers: int = 1) -> Hall:
         asyncio.run(scene(hall))  # type: ignore[arg-type]
     finally:
         hall.may_go.set()
-        hall.pool.close()
+        hall.pool.close(WAIT_S)
     return hall
 
 
@@ -164,16 +164,14 @@ def test_a_loop_that_has_ended_does_not_end_the_worker() -> None:
     asyncio.run(leave(hall))
     hall.may_go.set()
     asyncio.run(stay(hall))
-    hall.pool.close()
+    hall.pool.close(WAIT_S)
 
 
-def test_closing_says_which_worker_is_stuck(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    monkeypatch.setattr("viflow_anomaly_service.detector_pool.JOIN_SECONDS", 0.05)
-
+def test_closing_says_which_worker_is_stuck(caplog: pytest.LogCaptureFixture) -> None:
     async def scene(hall: Hall) -> None:
         await hall.submit(0)
         await reached(lambda: hall.begun == [0])
-        hall.pool.close()
+        hall.pool.close(0.05)
 
     in_hall(scene)
     assert "workers_still_busy" in caplog.messages

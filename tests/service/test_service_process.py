@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from serving_process import serving_process
 
 from viflow_anomaly.errors import CheckpointError, ConfigError
 from viflow_anomaly_service import server as service_server
@@ -72,6 +73,31 @@ def test_run_ends_with_the_error_of_a_model_that_cannot_be_loaded(
     with pytest.raises(CheckpointError, match=r"model\.safetensors"):
         service_server.run(ServiceSettings(port=0), load_detector=load)
     assert os.environ["OMP_WAIT_POLICY"] == "PASSIVE"
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize(
+    ("setup", "settings", "told"),
+    [
+        ("sys.modules['sqlalchemy'] = None", {"store_url": "unused.db"}, "pip install 'viflow-anomaly[store]'"),
+        ("pass", {"mqtt_url": "mqtt://a.example"}, "mqtt_url: expected a store beside it"),
+    ],
+)
+def test_what_cannot_be_used_ends_the_service_before_it_listens(
+    workers: int, setup: str, settings: dict[str, Any], told: str
+) -> None:
+    with serving_process(setup=setup, workers=workers, ready=False, **settings) as serving:
+        assert serving.process.wait(timeout=60) != 0
+    assert any(told in line for line in serving.other_lines)
+    assert not serving.events("listening")
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_where_it_listens_is_told_once_and_is_answered(workers: int) -> None:
+    with serving_process(workers=workers) as serving, serving.client() as client:
+        assert client.get("/healthz").status_code == 200
+        (told,) = serving.events("listening")
+        assert (told["host"], told["workers"]) == ("127.0.0.1", workers)
 
 
 def test_bind_both_families_and_refuses_what_is_not_ours() -> None:

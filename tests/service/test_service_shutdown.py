@@ -17,6 +17,8 @@ from serving_process import ServingProcess, serving_process
 from test_service_load import begin_request
 
 STOP = [signal.SIGTERM, signal.SIGINT]
+PATIENT = {"queue_timeout_s": 60.0, "shutdown_timeout_s": 60}
+"""A process's first pair takes seconds on a busy machine."""
 
 
 def in_flight(serving: ServingProcess) -> float:
@@ -28,12 +30,12 @@ def in_flight(serving: ServingProcess) -> float:
 @pytest.mark.parametrize("number", STOP)
 def test_accepted_work_is_finished_also_what_still_waits(number: signal.Signals) -> None:
     with (
-        serving_process(delay_s=0.4, max_concurrent=1, max_queued=3) as serving,
+        serving_process(delay_s=0.4, max_concurrent=1, max_queued=3, **PATIENT) as serving,
         serving.client() as client,
         ThreadPoolExecutor(max_workers=4) as clients,
     ):
         running = [clients.submit(client.post, "/detect", json=json_request(seed=seed)) for seed in range(4)]
-        wait_until(lambda: in_flight(serving) == 4)
+        wait_until(lambda: in_flight(serving) == 4, seconds=30)
         serving.process.send_signal(number)
         assert [answer.result().status_code for answer in running] == [200] * 4
         assert serving.process.wait(timeout=15) == 0
@@ -74,7 +76,7 @@ def test_nobody_is_admitted_once_the_gate_is_closed() -> None:
 
 
 def test_several_processes_finish_their_work_and_end_together() -> None:
-    with serving_process(delay_s=0.5, workers=2, max_concurrent=1, max_queued=8) as serving:
+    with serving_process(delay_s=0.5, workers=2, max_concurrent=1, max_queued=8, **PATIENT) as serving:
         with ThreadPoolExecutor(max_workers=6) as clients:
 
             def ask(seed: int) -> int:
@@ -82,7 +84,7 @@ def test_several_processes_finish_their_work_and_end_together() -> None:
                     return client.post("/detect", json=json_request(seed=seed)).status_code
 
             running = [clients.submit(ask, seed) for seed in range(6)]
-            wait_until(lambda: in_flight(serving) == 6)
+            wait_until(lambda: in_flight(serving) == 6, seconds=30)
             serving.process.terminate()
             assert [answer.result() for answer in running] == [200] * 6
         assert serving.process.wait(timeout=20) == 0

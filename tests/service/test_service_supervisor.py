@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -53,13 +54,21 @@ def no_waiting(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
     monkeypatch.setenv("PROMETHEUS_MULTIPROC_DIR", str(tmp_path))
 
 
-def started_with(monkeypatch: pytest.MonkeyPatch, coming: list[Worker], *, stop_after: int) -> Supervisor:
-    """A supervisor of two whose processes are ``coming``, one after the other; ends when that many were started."""
+def started_with(
+    monkeypatch: pytest.MonkeyPatch,
+    coming: list[Worker],
+    *,
+    stop_after: int,
+    on_listening: Callable[[], None] = lambda: None,
+) -> Supervisor:
+    """A supervisor of two whose processes are ``coming``, one after the other; ends when that many were started. Each
+    says at once that it listens."""
     stop = StopSignals()
-    supervisor = Supervisor(ServiceSettings(workers=2), None, stop)
+    supervisor = Supervisor(ServiceSettings(workers=2), None, stop, on_listening=on_listening)
     started: list[Worker] = []
 
-    def process(**_: Any) -> Any:
+    def process(*, args: tuple[Any, ...], **_: Any) -> Any:
+        args[-1].send_bytes(b".")
         worker = coming[len(started)]
         started.append(worker)
         stop.requested = len(started) == stop_after
@@ -77,6 +86,13 @@ def test_a_process_that_a_signal_ended_is_replaced(
     started_with(monkeypatch, workers, stop_after=3).run()
     assert [worker.exitcode for worker in workers] == [-signal.SIGKILL, 0, 0]
     assert caplog.messages == ["worker_died"]
+
+
+def test_the_first_process_that_listens_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    workers = [Worker(exitcode=-signal.SIGKILL), Worker(), Worker()]
+    started_with(monkeypatch, workers, stop_after=3, on_listening=lambda: told.append("listening")).run()
+    assert told == ["listening"]
 
 
 def test_a_process_that_cannot_start_ends_all(monkeypatch: pytest.MonkeyPatch) -> None:

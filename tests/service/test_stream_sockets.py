@@ -210,10 +210,62 @@ def test_a_message_too_large_closes_with_1009(streaming: LiveServer, in_fragment
         assert closed.value.rcvd.code == 1009
 
 
-def test_text_that_is_none_closes_with_1007(streaming: LiveServer) -> None:
+@pytest.mark.parametrize("in_fragments", [False, True])
+def test_text_that_is_none_closes_with_1007(
+    streaming: LiveServer, caplog: pytest.LogCaptureFixture, in_fragments: bool
+) -> None:
+    caplog.set_level("INFO")
     with opened(streaming, "text") as socket:
-        socket.send(b"\xff\xfe", text=True)
+        socket.send([b'{"id": "', b"\xff\xfe"] if in_fragments else b"\xff\xfe", text=True)
         assert closing(socket)[0] == 1007
+    wait_until(lambda: "websocket" in caplog.messages)
+    assert no_faults(caplog)
+    (line,) = (record for record in caplog.records if record.message == "websocket")
+    assert line.closed_with == 1007  # type: ignore[attr-defined]
+
+
+def test_a_letter_in_two_fragments_is_text(streaming: LiveServer) -> None:
+    with opened(streaming, "letter") as socket:
+        socket.send([b'{"id": "\xc3', b'\xa4"}'], text=True)
+        assert answered(socket)["id"] == "\xe4"
+
+
+def test_text_that_is_none_in_place_of_the_opening_closes(
+    streaming: LiveServer, caplog: pytest.LogCaptureFixture
+) -> None:
+    with connect(url(streaming.port, "text"), proxy=None) as socket:
+        socket.send(b"\xff", text=True)
+        assert closing(socket)[0] == 1007
+    wait_until(lambda: scraped(streaming)["viflow_websockets", ()] == 0)
+    assert no_faults(caplog)
+
+
+def test_text_that_is_none_while_a_pair_is_judged_ends_the_call(world: World, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    may_go, judging = threading.Event(), threading.Event()
+
+    def wait(pair: FramePair) -> None:
+        judging.set()
+        may_go.wait(60)
+
+    with live_server(lambda settings: DifferenceDetector(on_pair=wait), max_concurrent=1) as server:
+        try:
+            with opened(server, "text", {"camera": camera(world)}) as socket:
+                for k in range(2):
+                    socket.send(frame_message(world, k, as_binary=True))
+                assert judging.wait(30)
+                socket.send(b"\xff", text=True)
+                assert closing(socket)[0] == 1007
+            wait_until(lambda: scraped(server)["viflow_websockets", ()] == 0)
+        finally:
+            may_go.set()
+        wait_until(lambda: scraped(server)["viflow_requests_in_flight", ()] == 0)
+    assert no_faults(caplog)
+    assert [one.status for one in caplog.records if one.message == "message"] == [200, 499]  # type: ignore[attr-defined]
+
+
+def no_faults(caplog: pytest.LogCaptureFixture) -> bool:
+    return not [one for one in caplog.records if one.levelname in ("ERROR", "CRITICAL") or one.exc_info]
 
 
 @pytest.mark.parametrize(
@@ -222,6 +274,7 @@ def test_text_that_is_none_closes_with_1007(streaming: LiveServer) -> None:
         (b"\0\0\0\x02{}", "opening_missing"),
         ("{", "json_invalid"),
         ('{"frame": {}}', "field_unknown"),
+        ('{"fx": 70, "fy": 70}', "field_unknown"),
         ('{"options": {"model": 1}}', "field_invalid"),
         ('{"camera": "' + "x" * 70_000 + '"}', "body_too_large"),
     ],

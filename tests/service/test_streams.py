@@ -252,6 +252,7 @@ def test_a_wrong_call_is_named_and_begins_nothing(
         ({"frame": None}, "field_missing", "frame"),
         ({"source": ("s", b"1")}, "field_unknown", "source"),
         ({"request": (None, '{"zoom":1}')}, "field_unknown", "request.zoom"),
+        ({"request": (None, '{"fx": 70.0, "cx": 47.5}')}, "field_unknown", "request"),
     ],
 )
 def test_a_wrong_form_is_named(

@@ -6,6 +6,7 @@ import { isOpen } from "./tabs.js";
 import { nameOfStream } from "./words.js";
 
 const COMMAND = "viflow-anomaly calibrate RECORDING... \\\n  --false-alarms-per-hour 10 --out hall.json\nviflow-anomaly serve --calibration hall.json";
+const LEAST_FOOTAGE_S = 60; // one alarm in half a second would be 7,200 an hour
 const rounded = (value) => (value >= 100 ? Math.round(value).toLocaleString() : Number(value.toPrecision(3)).toString());
 
 export function addBudgetPanel(panel) {
@@ -36,14 +37,26 @@ function promised(found) {
 function raised(budget) {
   const rows = [...state.streams.values()].filter((stream) => stream.overview?.alarms_per_hour != null);
   if (!rows.length) return [h("p", { class: "quiet-note" }, "No judged footage yet.")];
-  const most = Math.max(budget ?? 0, ...rows.map((stream) => stream.overview.alarms_per_hour), 1);
-  const share = (value) => (value > 0 ? Math.max(0.02, Math.log1p(value) / Math.log1p(most)) : 0);
+  const told = rows.filter(({ overview }) => saysRate(overview)).map(({ overview }) => overview.alarms_per_hour);
+  const most = Math.max(budget ?? 0, ...told, 1);
   return [h("p", { class: "muted" }, "Regions labelled as motion, each pair counted, an hour of judged footage; true ones are among them. Bars are logarithmic."),
-    h("ul", { class: "plain-list" }, ...rows.map(({ id, overview }) => h("li", { class: "rate" },
-      h("span", { class: "list-row" }, h("span", { class: "grow" }, h("strong", {}, nameOfStream(id)), h("span", { class: "muted" }, ` ${overview.footage_s.toFixed(1)} s of footage`)), h("span", { class: "score" }, `${rounded(overview.alarms_per_hour)}/h`)),
-      s("svg", { viewBox: "0 0 300 10", class: "rate-bar", preserveAspectRatio: "none", "aria-hidden": "true" },
-        s("rect", { x: 0, y: 1, width: 300, height: 8, class: "track" }),
-        s("rect", { x: 0, y: 1, width: 300 * share(overview.alarms_per_hour), height: 8, class: "value" }),
-        budget ? s("rect", { x: 300 * share(budget) - 1, y: 0, width: 2, height: 10, class: "mark" }) : "")))),
-    h("p", { class: "muted" }, "A rate of a few seconds says little yet.")];
+    h("ul", { class: "plain-list" }, ...rows.map((stream) => rate(stream, budget, most))),
+    h("p", { class: "muted" }, "A rate of a few minutes says little yet.")];
+}
+
+const saysRate = (overview) => overview.footage_s >= LEAST_FOOTAGE_S;
+
+function rate({ id, overview }, budget, most) {
+  const name = [h("strong", {}, nameOfStream(id)), h("span", { class: "muted" }, ` ${overview.footage_s.toFixed(1)} s of footage`)];
+  if (!saysRate(overview)) {
+    return h("li", { class: "rate" }, h("span", { class: "list-row" }, h("span", { class: "grow" }, ...name),
+      h("span", { class: "muted" }, "less than 1 minute of footage "), h("span", { class: "score" }, "–")));
+  }
+  const share = (value) => (value > 0 ? Math.max(0.02, Math.log1p(value) / Math.log1p(most)) : 0);
+  return h("li", { class: "rate" },
+    h("span", { class: "list-row" }, h("span", { class: "grow" }, ...name), h("span", { class: "score" }, `${rounded(overview.alarms_per_hour)}/h`)),
+    s("svg", { viewBox: "0 0 300 10", class: "rate-bar", preserveAspectRatio: "none", "aria-hidden": "true" },
+      s("rect", { x: 0, y: 1, width: 300, height: 8, class: "track" }),
+      s("rect", { x: 0, y: 1, width: 300 * share(overview.alarms_per_hour), height: 8, class: "value" }),
+      budget ? s("rect", { x: 300 * share(budget) - 1, y: 0, width: 2, height: 10, class: "mark" }) : ""));
 }

@@ -25,7 +25,7 @@ export function addRegionsPanel(panel) {
     shown = key;
     reasons.replaceChildren(...detection.reasons.map((reason) => h("li", {}, h("strong", {}, reason.code.replaceAll("_", " ")), h("span", {}, reason.message))));
     list.replaceChildren(...detection.rois.map(roiItem));
-    if (!detection.rois.length) list.replaceChildren(h("li", { class: "quiet-note" }, detection.status === "abstained" ? "This pair cannot be judged: the reasons stand above." : "No regions: everything here is explained by the camera's own motion."));
+    if (!detection.rois.length) list.replaceChildren(h("li", { class: "quiet-note" }, detection.status === "abstained" ? "This pair cannot be judged: the first of the reasons above decided that." : "No regions: everything here is explained by the camera's own motion."));
     const roi = detection.rois.find((one) => one.id === state.roi);
     detail.replaceChildren(...(roi ? detailOf(pair, detection, roi, look) : hypothesesOf(look)));
     if (focused?.startsWith("roi-")) document.getElementById(focused)?.focus();
@@ -109,11 +109,11 @@ function hypothesesOf(look) {
   const bars = errors.map((error, index) => [`${index + 1}`, error, index === winner ? "won" : ""]);
   if (corrected !== null) bars.push(["corrected", corrected, "after"]);
   const told = `${counted(errors.length, "guess", "guesses")} of the camera's motion: number ${winner + 1} rebuilds the frame best` + (corrected === null ? "." : `, and the correction on the target image goes on from it.`);
-  return [h("h3", {}, "Hypotheses"), h("p", { class: "muted" }, told),
-    h("ul", { class: "bars", "aria-label": "Error of each hypothesis, smaller is better" }, ...bars.map(([name, error, kind]) => {
+  return [h("h3", {}, "Hypotheses"), h("p", { class: "muted" }, `${told} Bars are the mean error of the rebuilt frame, in standard deviations (σ) of its brightness; shorter is better.`),
+    h("ul", { class: "bars", "aria-label": "Error of each hypothesis in standard deviations, smaller is better" }, ...bars.map(([name, error, kind]) => {
       const bar = h("span", { class: "bar-fill", "aria-hidden": "true" });
       bar.style.setProperty("--share", String((error ?? 0) / most));
-      return h("li", { class: kind }, h("span", { class: "bar-name" }, name, kind === "won" ? h("span", { class: "chip" }, "won") : null), h("span", { class: "bar-room" }, bar), h("span", { class: "score" }, number(error, 3)));
+      return h("li", { class: kind }, h("span", { class: "bar-name" }, name, kind === "won" ? h("span", { class: "chip" }, "won") : null), h("span", { class: "bar-room" }, bar), h("span", { class: "score" }, number(error, 3), error === null ? null : h("span", { class: "unit" }, " σ")));
     }))];
 }
 

@@ -10,6 +10,8 @@ const W = 1000;
 const BARS = 74;
 const LANE = 9;
 const MOST_LANES = 5;
+const THING = 12;
+const CORNER = 10;
 const LEAST_SLOTS = 40; // a few pairs begin at the left and leave room
 
 let slider, picture, live, told;
@@ -84,8 +86,11 @@ function svgOf(pairs, at) {
 function thingMarks(pairs, thing, step) {
   return [[thing.from_ns, "began"], [thing.to_ns, "ended"]].filter(([ns, kind]) => ns !== null && (kind === "began" || thing.to_ns !== thing.from_ns))
     .map(([ns, kind]) => [pairAt(pairs, ns), kind]).filter(([at]) => at >= 0)
-    .map(([at, kind]) => s("path", { d: `M${at * step} 0h12l-6 9z`, class: `thing ${kind}` }));
+    .map(([at, kind]) => s("path", { d: `M${thingLeft(at, step)} 2h${THING}l-6 9z`, class: `thing ${kind}` }));
 }
+
+/** Above the middle of its pair, but clear of the picture's round corners. */
+const thingLeft = (at, step) => Math.min(Math.max((at + 0.5) * step - THING / 2, CORNER), W - THING - CORNER);
 
 function mark(pair, x, step) {
   const width = Math.max(step * 0.72, 1);
