@@ -1,7 +1,7 @@
 # make demo   a virtual environment of its own, then the main job on the bundled model and the bundled sample
 # make test   the gate: lint, format, strict types, import direction, tests with a branch-coverage floor
 # Others: lint, model and head (simulate, train, measure), evaluate, reproduction (the paper's table), detection-suite,
-# detection-ablations, detection-robustness, thin-structures, benchmark, wheel, audit (known vulnerabilities), sbom, clean, distclean. Needs Python >= 3.11, make and git;
+# detection-ablations, detection-robustness, internal-sizes, thin-structures, benchmark, wheel, audit (known vulnerabilities), sbom, clean, distclean. Needs Python >= 3.11, make and git;
 # fetches from package indexes only.
 
 SHELL := /bin/bash
@@ -41,7 +41,7 @@ REPRODUCTION_DIR ?= runs/reproduction
 HELD_OUT_SEQUENCES ?= 12
 HELD_OUT_FRAMES ?= 20
 
-.PHONY: demo test lint model head held-out evaluate reproduction detection-suite detection-ablations detection-robustness thin-structures \
+.PHONY: demo test lint model head held-out evaluate reproduction detection-suite detection-ablations detection-robustness internal-sizes thin-structures \
   benchmark \
   wheel audit sbom clean distclean
 
@@ -181,6 +181,10 @@ detection-ablations: held-out
 # What a wrong calibration costs: time offset, mounting, gyro bias, focal length, noise, brightness.
 detection-robustness: held-out
 	$(BIN)/python benchmarks/detection_robustness.py $(MODEL_DIR)/held-out/*
+
+# What judging large pictures at a smaller size costs and saves; times are meant for an idle machine.
+internal-sizes: $(VENV)/.installed-dev
+	$(BIN)/python benchmarks/internal_sizes.py --jobs $(MODEL_JOBS)
 
 # False alarms on railings, bare trees, poles and wires, where nothing moves by itself.
 thin-structures: $(VENV)/.installed-dev
