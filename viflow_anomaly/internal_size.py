@@ -1,7 +1,8 @@
 """A large picture is judged at a smaller size, and told in the pixels it came in.
 
-What the evidence head costs grows with the pixels; what it finds hardly does: docs/detection.md has the curve. On the
-way back a source pixel belongs to the internal pixel that its middle lies in; what is continuous is interpolated.
+What the evidence head costs grows with the pixels. In fewer of them large things are found as well, with fewer false
+alarms, and small ones are not: docs/detection.md has the curve. On the way back a source pixel belongs to the internal
+pixel that its middle lies in; what is continuous is interpolated.
 """
 
 from __future__ import annotations
