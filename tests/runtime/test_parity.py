@@ -39,6 +39,8 @@ SAMPLE = Path(__file__).parents[2] / "samples" / "drone"
 OTHERS: list[RuntimeName] = [name for name in get_args(RuntimeName) if name not in ("auto", "torch")]
 MAX_FLOW_DIFFERENCE_PX = 1e-3
 MAX_SIDE_DIFFERENCE_PX, MAX_SCORE_DIFFERENCE = 2, 0.01
+MAX_SCORE_DIFFERENCE_OF_ANOTHER_BOX = 0.1
+"""A pixel more makes another shape of a thing of sixty, and its shape is what a score is of."""
 MIN_SAME_SHARE = 0.85
 """Of all regions, that are the same to the pixel, with scores as near as ``SAME_SCORE``. Sums in another order (another
 CPU) move the flow by a thousandth of a pixel; a gray level of the reconstruction may be rounded the other way for that,
@@ -139,7 +141,9 @@ def test_the_regions_are_torchs(runtime: RuntimeName, name: str) -> None:
     sides = (np.array([corners(one.bbox) for one in answer.rois]) for answer in (found, expected(name)))
     np.testing.assert_allclose(*sides, rtol=0, atol=MAX_SIDE_DIFFERENCE_PX)
     for ours, theirs in zip(found.rois, expected(name).rois, strict=True):
-        assert ours.score == pytest.approx(theirs.score, abs=MAX_SCORE_DIFFERENCE)
+        same_box = ours.bbox == theirs.bbox
+        limit = MAX_SCORE_DIFFERENCE if same_box else MAX_SCORE_DIFFERENCE_OF_ANOTHER_BOX
+        assert ours.score == pytest.approx(theirs.score, abs=limit)
 
 
 @pytest.mark.parametrize("runtime", OTHERS)
