@@ -50,6 +50,21 @@ def url(port: int, name: str) -> str:
     return f"ws://127.0.0.1:{port}/streams/{name}"
 
 
+class Gate:
+    """Holds pairs up in the detector until it is opened."""
+
+    def __init__(self) -> None:
+        self.reached = threading.Event()
+        self._may_go = threading.Event()
+
+    def hold(self, pair: FramePair) -> None:
+        self.reached.set()
+        self._may_go.wait(60)
+
+    def open(self) -> None:
+        self._may_go.set()
+
+
 @contextlib.contextmanager
 def opened(server: Any, name: str, opening: dict[str, Any] | None = None, **options: Any) -> Iterator[ClientConnection]:
     """A connection whose stream is open."""
@@ -242,23 +257,18 @@ def test_text_that_is_none_in_place_of_the_opening_closes(
 
 def test_text_that_is_none_while_a_pair_is_judged_ends_the_call(world: World, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
-    may_go, judging = threading.Event(), threading.Event()
-
-    def wait(pair: FramePair) -> None:
-        judging.set()
-        may_go.wait(60)
-
-    with live_server(lambda settings: DifferenceDetector(on_pair=wait), max_concurrent=1) as server:
+    gate = Gate()
+    with live_server(lambda settings: DifferenceDetector(on_pair=gate.hold), max_concurrent=1) as server:
         try:
             with opened(server, "text", {"camera": camera(world)}) as socket:
                 for k in range(2):
                     socket.send(frame_message(world, k, as_binary=True))
-                assert judging.wait(30)
+                assert gate.reached.wait(30)
                 socket.send(b"\xff", text=True)
                 assert closing(socket)[0] == 1007
             wait_until(lambda: scraped(server)["viflow_websockets", ()] == 0)
         finally:
-            may_go.set()
+            gate.open()
         wait_until(lambda: scraped(server)["viflow_requests_in_flight", ()] == 0)
     assert no_faults(caplog)
     assert [one.status for one in caplog.records if one.message == "message"] == [200, 499]  # type: ignore[attr-defined]
@@ -315,12 +325,7 @@ def test_one_socket_too_many_is_refused(world: World) -> None:
 
 
 def test_what_comes_too_fast_waits_in_the_network(world: World) -> None:
-    may_go, judged = threading.Event(), threading.Event()
-
-    def wait(pair: FramePair) -> None:
-        judged.set()
-        may_go.wait(60)
-
+    gate = Gate()
     noise = b"\0" * (1024 * 1024)
 
     async def flood(port: int) -> int:
@@ -328,21 +333,21 @@ def test_what_comes_too_fast_waits_in_the_network(world: World) -> None:
             await socket.send(json.dumps({"camera": camera(world)}))
             for k in range(2):
                 await socket.send(frame_message(world, k, as_binary=True))
-            assert await asyncio.to_thread(judged.wait, 30)
+            assert await asyncio.to_thread(gate.reached.wait, 30)
             sent = 0
             with contextlib.suppress(TimeoutError):
                 while sent < 128:
                     async with asyncio.timeout(2):
                         await socket.send(noise)
                     sent += 1
-            may_go.set()
+            gate.open()
             return sent
 
-    with live_server(lambda settings: DifferenceDetector(on_pair=wait), max_websocket_bytes=2**21) as server:
+    with live_server(lambda settings: DifferenceDetector(on_pair=gate.hold), max_websocket_bytes=2**21) as server:
         try:
             assert asyncio.run(flood(server.port)) < 64
         finally:
-            may_go.set()
+            gate.open()
 
 
 def test_before_the_opening_is_accepted_nothing_else_is_taken_in() -> None:
@@ -402,15 +407,10 @@ def test_who_does_not_read_answers_is_let_go() -> None:
 
 
 def test_an_overloaded_service_says_so_and_the_socket_goes_on(world: World) -> None:
-    may_go, judging = threading.Event(), threading.Event()
-
-    def wait(pair: FramePair) -> None:
-        judging.set()
-        may_go.wait(60)
-
+    gate = Gate()
     limits = {"max_concurrent": 1, "max_queued": 0}
     with (
-        live_server(lambda settings: DifferenceDetector(on_pair=wait), **limits) as server,
+        live_server(lambda settings: DifferenceDetector(on_pair=gate.hold), **limits) as server,
         opened(server, "a", {"camera": camera(world)}) as first,
         opened(server, "b", {"camera": camera(world)}) as second,
     ):
@@ -418,12 +418,12 @@ def test_an_overloaded_service_says_so_and_the_socket_goes_on(world: World) -> N
             for k in range(2):
                 first.send(frame_message(world, k, as_binary=True))
             assert answered(first)["answer"]["begun"]
-            assert judging.wait(30)
+            assert gate.reached.wait(30)
             second.send(frame_message(world, 0, as_binary=True, message_id=5))
             said = answered(second)
             assert (said["problem"]["code"], said["id"], said["retry_after_s"]) == ("overloaded", 5, 1)
         finally:
-            may_go.set()
+            gate.open()
         assert len(answered(first)["answer"]["detections"]) == 1
         second.send(frame_message(world, 0, as_binary=True))
         assert answered(second)["answer"]["begun"]
@@ -447,25 +447,20 @@ def test_a_wrong_name_and_other_paths(streaming: LiveServer) -> None:
 
 @pytest.mark.parametrize("waiting", [0, 3, 12])
 def test_a_client_that_leaves_while_its_pair_is_judged(world: World, waiting: int) -> None:
-    may_go, judging = threading.Event(), threading.Event()
-
-    def wait(pair: FramePair) -> None:
-        judging.set()
-        may_go.wait(60)
-
-    with live_server(lambda settings: DifferenceDetector(on_pair=wait), max_concurrent=1) as server:
+    gate = Gate()
+    with live_server(lambda settings: DifferenceDetector(on_pair=gate.hold), max_concurrent=1) as server:
         try:
             with opened(server, "left", {"camera": camera(world)}) as socket:
                 for k in range(2):
                     socket.send(frame_message(world, k, as_binary=True))
                 assert answered(socket)["answer"]["begun"]
-                assert judging.wait(30)
+                assert gate.reached.wait(30)
                 for k in range(waiting):  # also where they keep the service from reading on
                     socket.send(frame_message(world, 2 + k % 2, as_binary=True))
                 socket.socket.shutdown(SHUT_RDWR)  # no goodbye
             wait_until(lambda: scraped(server)["viflow_websockets", ()] == 0)
         finally:
-            may_go.set()
+            gate.open()
         wait_until(lambda: scraped(server)["viflow_requests_in_flight", ()] == 0)
         # The call had not been answered: the stream is where it was, and takes it again.
         again = server.client.post("/streams/left/frames", json=call(world, 1)).json()

@@ -50,6 +50,16 @@ Runtime = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on stdout, and nothing else there.")]
 
 
+def told(defaults: Mapping[str, Any]) -> str:
+    """Defaults as a help text names them."""
+    return ", ".join(f"{key}={value:g}" for key, value in defaults.items())
+
+
+def in_section(section: str, defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """Defaults of one section, as ``settings_from`` takes them."""
+    return {f"{section}.{key}": value for key, value in defaults.items()}
+
+
 def settings_from(
     config: Path | None,
     assignments: Sequence[str] | None,

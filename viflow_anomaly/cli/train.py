@@ -17,11 +17,11 @@ from viflow_anomaly.cli.options import (
     Seed,
     Steps,
     TrainingThreads,
+    in_section,
     settings_from,
+    told,
 )
 from viflow_anomaly.config import FINE_TUNING_DEFAULTS
-
-FINE_TUNING = ", ".join(f"{key}={value:g}" for key, value in FINE_TUNING_DEFAULTS.items())
 
 
 def train(
@@ -32,7 +32,7 @@ def train(
         typer.Option(
             metavar="default|PATH",
             help="Start from a checkpoint's weights (default: the bundled model's) and take its model settings. Unless "
-            f"they are set, {FINE_TUNING}.",
+            f"they are set, {told(FINE_TUNING_DEFAULTS)}.",
         ),
     ] = None,
     validation: Annotated[
@@ -68,8 +68,8 @@ def train(
         "training.threads": threads,
         "device": device,
     }
-    fine_tuning = {f"training.{key}": value for key, value in FINE_TUNING_DEFAULTS.items()}
-    settings = settings_from(config, assignments, options, defaults=None if init is None else fine_tuning)
+    fine_tuning = None if init is None else in_section("training", FINE_TUNING_DEFAULTS)
+    settings = settings_from(config, assignments, options, defaults=fine_tuning)
     from viflow_anomaly.checkpoint_record import bundled_checkpoint
     from viflow_anomaly.training import train as train_model
 

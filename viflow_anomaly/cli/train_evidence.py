@@ -17,14 +17,14 @@ from viflow_anomaly.cli.options import (
     Seed,
     Steps,
     TrainingThreads,
+    in_section,
     load_detector,
     settings_from,
+    told,
 )
 from viflow_anomaly.cli.progress import stderr_progress
 from viflow_anomaly.config import EVIDENCE_FINE_TUNING_DEFAULTS
 from viflow_anomaly.errors import DatasetError
-
-FINE_TUNING = ", ".join(f"{key}={value:g}" for key, value in EVIDENCE_FINE_TUNING_DEFAULTS.items())
 
 
 def train_evidence(
@@ -41,7 +41,7 @@ def train_evidence(
         typer.Option(
             metavar="default|PATH",
             help="Start from a head's weights (the word default: the bundled one's) and take its structure. Unless "
-            f"they are set, {FINE_TUNING}.",
+            f"they are set, {told(EVIDENCE_FINE_TUNING_DEFAULTS)}.",
         ),
     ] = None,
     steps: Steps = None,
@@ -72,8 +72,8 @@ def train_evidence(
         "checkpoint": checkpoint,
         "device": device,
     }
-    fine_tuning = {f"evidence_training.{key}": value for key, value in EVIDENCE_FINE_TUNING_DEFAULTS.items()}
-    settings = settings_from(config, assignments, options, defaults=None if init is None else fine_tuning)
+    fine_tuning = None if init is None else in_section("evidence_training", EVIDENCE_FINE_TUNING_DEFAULTS)
+    settings = settings_from(config, assignments, options, defaults=fine_tuning)
     # There is no head yet, and the one that comes judges every pair.
     settings = settings.model_copy(update={"detector": settings.detector.model_copy(update={"evidence": "auto"})})
     from viflow_anomaly.checkpoint_record import bundled_evidence_head
