@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sqlite3
 import time
 from pathlib import Path
 from typing import Any, Final
@@ -25,6 +26,7 @@ CONNECTIONS: Final = 4
 UNTIL: Final = "until"
 """Among what is known of an SQLite connection: on the monotonic clock, when its transaction takes too long."""
 _STEPS_A_LOOK: Final = 100_000
+_LOOK_AGAIN_SECONDS: Final = 0.01
 _MIGRATION_LOCK: Final = 0x7669666C6F77  # any number that nobody else takes
 _SQLITE_PRAGMAS: Final = (
     f"PRAGMA busy_timeout={STATEMENT_SECONDS * 1000}",
@@ -89,7 +91,7 @@ def _own_sqlite_transactions(engine: Engine) -> None:
     def on_connect(connection: Any, record: Any) -> None:
         connection.isolation_level = None
         for pragma in _SQLITE_PRAGMAS:
-            connection.execute(pragma).close()
+            _execute_when_free(connection, pragma)
         known = record.info
         connection.set_progress_handler(lambda: time.monotonic() > known.get(UNTIL, math.inf), _STEPS_A_LOOK)
 
@@ -98,6 +100,20 @@ def _own_sqlite_transactions(engine: Engine) -> None:
         connection.info[UNTIL] = time.monotonic() + STATEMENT_SECONDS
         writes = connection.get_execution_options().get("writes", False)
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+
+
+def _execute_when_free(connection: sqlite3.Connection, pragma: str) -> None:
+    """SQLite does not wait, as its busy_timeout says, where several connections turn a new file to WAL at once."""
+    until = time.monotonic() + STATEMENT_SECONDS
+    while True:
+        try:
+            connection.execute(pragma).close()
+        except sqlite3.OperationalError as err:
+            if not err.sqlite_errorname.startswith("SQLITE_BUSY") or time.monotonic() > until:
+                raise
+            time.sleep(_LOOK_AGAIN_SECONDS)
+        else:
+            return
 
 
 def migrate(engine: Engine) -> None:

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from threading import Barrier
+from typing import Any
 
 import pytest
 import sqlalchemy as sa
@@ -202,6 +204,23 @@ def test_many_open_an_empty_store_at_once(empty_store_url: str) -> None:
     assert len(stores[0].page(PageRequest(DetectionFilter()))[0]) == 4
     for one in stores:
         one.close()
+
+
+def test_many_connect_to_a_new_file_at_once(tmp_path: Path) -> None:
+    """SQLite refuses a second change to WAL at once, whatever its busy_timeout; a few in a hundred meet."""
+    for attempt in range(20):
+        engines = [make_engine(store_url(str(tmp_path / f"{attempt}.db"))) for _ in range(8)]
+        together = Barrier(len(engines))
+
+        def mode_of(engine: sa.Engine, together: Barrier = together) -> Any:
+            together.wait()
+            with engine.connect() as connection:
+                return connection.execute(sa.text("PRAGMA journal_mode")).scalar_one()
+
+        with ThreadPoolExecutor(len(engines)) as threads:
+            assert list(threads.map(mode_of, engines)) == ["wal"] * len(engines)
+        for engine in engines:
+            engine.dispose()
 
 
 def test_tables_of_a_later_version_are_left_alone(empty_store_url: str) -> None:
