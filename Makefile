@@ -119,19 +119,19 @@ model: held-out
 head: held-out
 	simulate() { $(BIN)/viflow-anomaly simulate --rig $$1 --seed $$2 --sequences $$3 --frames $$4 --jobs $(MODEL_JOBS) \
 	  --out $(MODEL_DIR)/$$5 "$${@:6}" >/dev/null; }; \
-	simulate drone 30000 179 16 head; simulate drone 30200 200 16 head; simulate drone 32000 300 12 head; \
-	simulate drone 31000 20 10 head --set simulator.width=752 --set simulator.height=480; \
-	simulate drone 33000 60 12 head --set simulator.thin_structures=24; \
-	simulate car 80000 120 16 head; simulate car 80200 200 16 head; simulate car 82000 150 12 head; \
+	simulate drone 30000 179 16 head; simulate drone 30200 200 16 head; simulate drone 32000 256 12 head; \
+	simulate drone 31000 12 10 head --set simulator.width=752 --set simulator.height=480; \
+	simulate drone 33000 30 12 head --set simulator.thin_structures=24; \
+	simulate car 80000 60 16 head; simulate car 80200 100 16 head; simulate car 82000 90 12 head; \
 	simulate car 81000 24 10 head --set simulator.width=832 --set simulator.height=256; \
-	simulate car 83000 60 12 head --set simulator.thin_structures=80; \
-	simulate drone 36000 120 12 head --set simulator.foliage=16; \
-	simulate drone 36200 60 8 head --set simulator.width=752 --set simulator.height=480 --set simulator.foliage=12; \
-	simulate drone 36300 140 12 head --set 'simulator.movers=[3,8]'; \
-	simulate car 86000 60 6 head --set simulator.width=1242 --set simulator.height=375 --set simulator.foliage=60; \
-	simulate car 86100 90 8 head --set simulator.width=832 --set simulator.height=256 --set simulator.foliage=50; \
-	simulate car 86300 120 12 head --set simulator.foliage=50; \
-	simulate car 86500 60 8 head --set simulator.width=1242 --set simulator.height=375; \
+	simulate car 83000 30 12 head --set simulator.thin_structures=80; \
+	simulate drone 36000 60 12 head --set simulator.foliage=16; \
+	simulate drone 36200 30 8 head --set simulator.width=752 --set simulator.height=480 --set simulator.foliage=12; \
+	simulate drone 36300 70 12 head --set 'simulator.movers=[3,8]'; \
+	simulate car 86000 30 6 head --set simulator.width=1242 --set simulator.height=375 --set simulator.foliage=60; \
+	simulate car 86100 40 8 head --set simulator.width=832 --set simulator.height=256 --set simulator.foliage=50; \
+	simulate car 86300 60 12 head --set simulator.foliage=50; \
+	simulate car 86500 30 8 head --set simulator.width=1242 --set simulator.height=375; \
 	simulate drone 35000 50 7 head-calibration; simulate car 85000 50 7 head-calibration; \
 	simulate drone 35500 12 12 head-calibration --set simulator.thin_structures=24; \
 	simulate car 85500 12 12 head-calibration --set simulator.thin_structures=80; \

@@ -38,18 +38,26 @@ def add_ground_truth(
     return folder
 
 
-def add_movers(folder: Path) -> Path:
-    """Two movers in every frame of such a recording: number 1 shifts by 4 px, number 2 by half a pixel."""
+def add_movers(folder: Path, *, times: int = 1) -> Path:
+    """Two movers in every frame of such a recording: number 1 shifts by 4 px, number 2 by half a pixel.
+
+    Args:
+        times: how many times as large they are, and as far from the corner.
+    """
     truth = folder / "mav0" / "groundtruth0"
     (truth / "instances").mkdir()
     stamps = sorted(int(path.stem) for path in (truth / "depth").glob("*.png"))
     height, width = read_depth_png(truth / "depth" / f"{stamps[0]}.png").shape
     instances = np.zeros((height, width), np.uint8)
-    instances[10:20, 30:44] = 1
-    instances[30:40, 5:15] = 2
-    lines = [",".join(OBJECT_COLUMNS)]
+    lines = []
+    for thing, flow_px, edges in ((1, 4.0, (30, 10, 44, 20)), (2, 0.5, (5, 30, 15, 40))):
+        left, top, right, bottom = (times * edge for edge in edges)
+        instances[top:bottom, left:right] = thing
+        area_px = (right - left) * (bottom - top)
+        lines.append(f"{thing},{area_px},{left},{top},{right - 1},{bottom - 1},{flow_px}")
+    rows = [",".join(OBJECT_COLUMNS)]
     for stamp in stamps:
         write_instances_png(truth / "instances" / f"{stamp}.png", instances)
-        lines += [f"{stamp},1,140,30,10,43,19,4.0", f"{stamp},2,100,5,30,14,39,0.5"]
-    (truth / "objects.csv").write_text("\n".join(lines) + "\n")
+        rows += [f"{stamp},{line}" for line in lines]
+    (truth / "objects.csv").write_text("\n".join(rows) + "\n")
     return folder

@@ -33,6 +33,13 @@ def test_as_many_are_perturbed_as_asked_for() -> None:
     assert 250 < touched < 350
 
 
+def test_as_many_are_at_their_own_size_as_asked_for() -> None:
+    draws = [Augment(1, 0.6, 0.5).at_own_size(f"r{k}") for k in range(500)]
+    assert 200 < sum(draws) < 300
+    assert draws == [Augment(1, 0.0, 0.5).at_own_size(f"r{k}") for k in range(500)]
+    assert not any(Augment(1, 0.6).at_own_size(f"r{k}") for k in range(50))
+
+
 def test_contrast_spreads_both_images_alike(pair: FramePair) -> None:
     spread = change_contrast(pair, factor=2.0, pivot_gray=0.0)
     pivot = float(pair.source.image.mean())

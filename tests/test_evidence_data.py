@@ -9,78 +9,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 from evidence_world import SMALL, recording
-from simulated_truth import add_ground_truth
+from simulated_truth import add_ground_truth, add_movers
 from worlds import make_world
 
 from viflow_anomaly.config import CorrectionConfig, DetectorConfig
-from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
-from viflow_anomaly.datasets.ground_truth_png import write_instances_png
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import DatasetError
 from viflow_anomaly.evidence_augmentation import Augment
 from viflow_anomaly.evidence_cues import GEOMETRIC_CUES
 from viflow_anomaly.evidence_data import (
     ACROSS,
-    IGNORED,
-    MOVING,
-    SEAM,
     EvidenceData,
     Examples,
     extract_examples,
     kept_examples,
     load_examples,
-    offsets_of,
-    truth_of,
 )
+from viflow_anomaly.evidence_truth import IGNORED, MOVING, SIZE_SHIFT, offsets_of
 
 
 @pytest.fixture(scope="module")
 def detector() -> AnomalyDetector:
     return AnomalyDetector.from_checkpoint(with_evidence=False)
-
-
-def truth_folder(path: Path) -> GroundTruthFolder:
-    found = GroundTruthFolder.find(path)
-    assert found is not None
-    return found
-
-
-def stamps(truth: GroundTruthFolder) -> list[int]:
-    return sorted(int(path.stem) for path in (truth.folder / "instances").glob("*.png"))
-
-
-def test_movers_count_and_slow_ones_do_not(tmp_path: Path) -> None:
-    truth = truth_folder(recording(tmp_path / "drone_1"))
-    seen = truth_of(truth, stamps(truth)[0])
-    assert (seen[10:20, 30:44] == MOVING).all()
-    assert (seen[30:40, 5:15] == IGNORED).all()
-    assert np.count_nonzero(seen) == 140 + 100
-
-
-def test_where_two_movers_touch_there_is_a_seam(tmp_path: Path) -> None:
-    truth = truth_folder(recording(tmp_path / "drone_1"))
-    stamp = stamps(truth)[0]
-    instances = truth.instances(stamp)
-    instances[10:20, 44:50] = 3
-    write_instances_png(truth.folder / "instances" / f"{stamp}.png", instances)
-    lines = (truth.folder / "objects.csv").read_text()
-    (truth.folder / "objects.csv").write_text(lines + f"{stamp},3,60,44,10,49,19,5.0\n")
-    seen = truth_of(truth_folder(tmp_path / "drone_1"), stamp)
-    assert (seen[10:20, 41:47] == MOVING | SEAM).all()
-    assert (seen[10:20, 30:41] == MOVING).all()
-    assert (seen[10:20, 47:50] == MOVING).all()
-
-
-def test_offsets_lead_to_the_middles_of_things() -> None:
-    instances = np.zeros((64, 96), np.uint8)
-    instances[8:24, 16:48], instances[40:64, 72:96] = 1, 2
-    offsets = offsets_of(instances, (16, 24))
-    rows, columns = np.mgrid[0:16, 0:24]
-    for thing, middle in ((1, (3.5, 7.5)), (2, (12.5, 20.5))):
-        mine = instances[2::4, 2::4] == thing
-        assert np.abs(rows[mine] + offsets[0][mine] - middle[0]).max() <= 0.5
-        assert np.abs(columns[mine] + offsets[1][mine] - middle[1]).max() <= 0.5
-    assert not offsets[:, instances[2::4, 2::4] == 0].any()
 
 
 def test_a_mirrored_thing_has_mirrored_offsets() -> None:
@@ -117,6 +67,22 @@ def test_examples_are_bytes_of_the_detectors_cues(tmp_path: Path, detector: Anom
     assert examples.photometric.shape == (2, 3, height, width)
     assert examples.geometric.shape == (2, len(GEOMETRIC_CUES), height // 4, width // 4)
     assert (examples.truth & MOVING).any()
+
+
+def test_a_large_picture_is_seen_at_the_size_it_is_judged_at(tmp_path: Path, detector: AnomalyDetector) -> None:
+    world = make_world(frames=2, width=416, height=352)
+    world = replace(world, camera=replace(world.camera, fx=320.0, fy=320.0))
+    path = add_movers(add_ground_truth(tmp_path / "large", world), times=4)
+    small = extract_examples(detector.with_config(DetectorConfig(internal_short_side_px=176)), path)
+    own = extract_examples(detector.with_config(DetectorConfig(internal_short_side_px=0)), path)
+    assert (small.truth.shape, own.truth.shape) == ((1, 192, 224), (1, 352, 416))
+    np.testing.assert_array_equal(small.truth[0, 20:40, 60:88] & MOVING, own.truth[0, 41:81:2, 121:177:2] & MOVING)
+    assert (small.truth[0, 25, 70] >> SIZE_SHIFT, own.truth[0, 51, 141] >> SIZE_SHIFT) == (9, 11)
+    np.testing.assert_array_equal(small.truth[0, 176:], IGNORED)  # beyond the picture
+    kept = tmp_path / "cues"
+    large = detector.with_config(DetectorConfig(internal_short_side_px=176))
+    for share, height in ((0.0, 192), (1.0, 352)):
+        assert kept_examples(large, path, kept, augment=Augment(3, 0.0, share)).truth.shape[1] == height
 
 
 def test_what_was_kept_is_read_as_long_as_it_would_be_the_same(tmp_path: Path, detector: AnomalyDetector) -> None:

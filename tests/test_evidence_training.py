@@ -18,9 +18,10 @@ from viflow_anomaly.config import EvidenceHeadConfig, EvidenceTrainingConfig
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import CheckpointError, ConfigError, DatasetError
 from viflow_anomaly.evidence_cues import GEOMETRIC_CUES
-from viflow_anomaly.evidence_data import IGNORED, MOVING, SEAM, EvidenceBatch, offsets_of
+from viflow_anomaly.evidence_data import EvidenceBatch
 from viflow_anomaly.evidence_run import refit_scores, train_evidence
 from viflow_anomaly.evidence_training import EvidenceTraining, evidence_loss, offset_loss
+from viflow_anomaly.evidence_truth import IGNORED, MOVING, SEAM, SIZE_SHIFT, offsets_of
 from viflow_anomaly.moving_regions import REGION_FEATURES, probability_of
 from viflow_anomaly.region_score_fit import LabelledRegions, fit_region_score
 
@@ -94,6 +95,19 @@ def test_seams_count_where_something_moves() -> None:
     assert float(evidence_loss(logits, truth, motion_weight=1.0, seam_weight=1.0)) == pytest.approx(float(right))
     logits[0, 1, 3] = -9.0
     assert float(evidence_loss(logits, truth, motion_weight=1.0, seam_weight=1.0)) > float(right) + 1
+
+
+def test_pixels_of_small_movers_weigh_more() -> None:
+    """By the root of what the area is short of 1024, at most four times as much, and never less."""
+    logits, costs = torch.zeros(1, 2, 8, 8), {}
+    for log_area in (0, 4, 8, 10, 14):
+        truth = torch.full((1, 8, 8), MOVING | log_area << SIZE_SHIFT, dtype=torch.uint8)
+        rest, all_of_it = (
+            float(evidence_loss(logits, truth, motion_weight=weight, seam_weight=0.0, size_balance=0.5))
+            for weight in (1.0, 2.0)
+        )
+        costs[log_area] = (all_of_it - rest) / np.log(2)
+    assert costs == pytest.approx({0: 4.0, 4: 4.0, 8: 2.0, 10: 1.0, 14: 1.0}, rel=1e-5)
 
 
 def test_offsets_count_where_something_moves() -> None:

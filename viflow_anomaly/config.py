@@ -404,9 +404,18 @@ class EvidenceTrainingConfig(FrozenConfig):
     weight_decay: float = Field(default=1e-3, ge=0, le=10)
     gradient_clip: PositiveFloat = 1.0
     motion_weight: float = Field(default=3.0, gt=0, le=1e6, description="of a moving pixel beside a resting one")
+    size_balance: float = Field(
+        default=0.25,
+        ge=0,
+        le=1,
+        description="power of 1024 px over a smaller mover's area that its pixels weigh more by",
+    )
     seam_weight: float = Field(default=0.3, ge=0, le=1e6, description="of the loss of seams between two movers")
     offset_weight: float = Field(default=0.15, ge=0, le=1e6, description="of the loss of where a thing has its middle")
     augmented_share: float = Field(default=0.6, ge=0, le=1, description="recordings seen through a worse camera")
+    own_size_share: float = Field(
+        default=0.5, ge=0, le=1, description="recordings with all their pixels, not at the internal size"
+    )
     crop_width: int = Field(default=224, ge=32, le=8192, multiple_of=32)
     crop_height: int = Field(default=128, ge=32, le=8192, multiple_of=32)
     every: PositiveInt = Field(default=1, description="take every n-th pair of a recording")

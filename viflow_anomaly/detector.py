@@ -31,11 +31,12 @@ from viflow_anomaly.internal_size import InternalSize, internal_size
 from viflow_anomaly.model_input import prepare
 from viflow_anomaly.motion_evidence import (
     JudgedCues,
-    expects_head,
     judge_cues,
+    knows_depth,
     regions_of,
     require_our_cues,
     takes_head,
+    will_know_depth,
 )
 from viflow_anomaly.motion_input import MotionWindow
 from viflow_anomaly.pair_detector import Execution, LoadedWeights
@@ -247,7 +248,9 @@ class AnomalyDetector:
             for_head: as if one did.
         """
         model = self._record.model
-        takes_part = for_head or expects_head(self._evidence, model, self.config)
+        takes_part = for_head or takes_head(
+            self._evidence, self.config, knows_depth=will_know_depth(model, self.config)
+        )
         if model.view.mode == "center_crop" or not takes_part:
             return None
         height, width = pair.source.image.shape
@@ -319,7 +322,7 @@ class AnomalyDetector:
         model_input = prepare(pair, self._record.model)
         focal_px = self._record.model.view.focal_px
         predicted = predict_flow(self._runtime, model_input, self.config.correction, focal_px=focal_px)
-        if not for_head and not takes_head(self._evidence, predicted, self.config):
+        if not for_head and not takes_head(self._evidence, self.config, knows_depth=knows_depth(predicted)):
             return explain(pair, model_input, predicted, self.config), None
         alignment = align(pair, model_input, predicted, focal_px=focal_px)
         coordinates = alignment.target_coordinates

@@ -40,18 +40,27 @@ MAX_LOG_GAIN = 0.15
 
 
 class Augment(NamedTuple):
-    """Which recordings are perturbed: ``share`` of them, each in its own way."""
+    """Which recordings are perturbed: ``share`` of them, each in its own way. And ``own_size_share`` of them are judged
+    with all their pixels, whatever the internal size. Pure functions of the seed and the recording's name."""
 
     seed: int
     share: float
+    own_size_share: float = 0.0
 
     def of(self, name: str) -> Perturbation:
-        """A pure function of the seed and the recording's name."""
-        digest = hashlib.sha256(f"{self.seed}/{name}".encode()).digest()
-        rng = np.random.default_rng(list(digest[:16]))
+        """What a recording is seen through."""
+        rng = self._rng(name)
         if rng.random() >= self.share:
             return unperturbed
         return partial(_one_after_the_other, steps=tuple(_draw(rng)))
+
+    def at_own_size(self, name: str) -> bool:
+        """Whether a recording is judged with all its pixels."""
+        return bool(self._rng(f"size of {name}").random() < self.own_size_share)
+
+    def _rng(self, name: str) -> np.random.Generator:
+        digest = hashlib.sha256(f"{self.seed}/{name}".encode()).digest()
+        return np.random.default_rng(list(digest[:16]))
 
 
 NO_AUGMENT = Augment(0, 0.0)

@@ -16,26 +16,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from viflow_anomaly.checkpoint_record import write_atomically
-from viflow_anomaly.config import EVIDENCE_BLOCK_PX, MAX_OFFSET_BLOCKS, EvidenceTrainingConfig
-from viflow_anomaly.datasets.ground_truth_folder import GroundTruthFolder
+from viflow_anomaly.config import EVIDENCE_BLOCK_PX, EvidenceTrainingConfig
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import DatasetError, InvalidInputError
 from viflow_anomaly.evaluation.flow_truth import RecordingTruth
-from viflow_anomaly.evaluation.labelled_pairs import labels_of
 from viflow_anomaly.evaluation.perturbed_pairs import Perturbation, unperturbed
 from viflow_anomaly.evidence_augmentation import NO_AUGMENT, Augment
 from viflow_anomaly.evidence_cues import CUES_VERSION, GEOMETRIC_CUES, PHOTOMETRIC_CUES
+from viflow_anomaly.evidence_truth import IGNORED, MOVING, Scene, offsets_of, scene_of, truth_of
 from viflow_anomaly.geometry import Float32Array
 from viflow_anomaly.sensor_data import Uint8Array
 
-MOVING, IGNORED, SEAM = 1, 2, 4
-"""Bits of ``truth``: a counted mover; what counts neither way; a moving pixel near another moving thing."""
-SEAM_REACH_PX = 3
 BYTE_SCALE = np.float32(127.5)
 TRIES = 3
 """A crop without a mover is drawn anew this often: most of a picture rests."""
@@ -80,7 +75,8 @@ class Examples:
 def extract_examples(
     detector: AnomalyDetector, path: Path, *, every: int = 1, perturbation: Perturbation = unperturbed
 ) -> Examples:
-    """Cues and truth of every n-th pair of a recording with masks of what moves, seen through a perturbation.
+    """Cues and truth of every n-th pair of a recording with masks of what moves, seen through a perturbation and at the
+    size that the detector judges it at.
 
     Raises:
         DatasetError: ``ground_truth_missing`` where no pair is usable; as ``RecordingTruth``.
@@ -90,53 +86,22 @@ def extract_examples(
     for index in range(0, len(recording), every):
         try:
             pair = perturbation(recording.pair(index))
-            cues, inside = detector.cues(pair)
+            size = detector.internal_size(pair, for_head=True)
+            cues, inside = detector.cues(pair if size is None else size.reduce(pair))
         except InvalidInputError:
             continue
-        instances = recording.ground_truth.instances(pair.source.timestamp_ns)
-        seen = np.where(inside, truth_of(recording.ground_truth, pair.source.timestamp_ns), IGNORED)
+        scene = scene_of(recording.ground_truth, pair.source.timestamp_ns)
+        scene = scene if size is None else Scene(*(size.thin_out(part) for part in scene))
+        seen = np.where(inside, truth_of(scene), IGNORED)
         truth = np.full(cues.photometric.shape[1:], IGNORED, dtype=np.uint8)
         truth[: seen.shape[0], : seen.shape[1]] = seen
-        offsets = offsets_of(instances, cues.geometric.shape[1:])
+        offsets = offsets_of(scene.instances, cues.geometric.shape[1:])
         examples.append(Example(_as_bytes(cues.photometric), _as_bytes(cues.geometric), truth, offsets))
     if not examples:
         raise DatasetError(
             f"{path}: expected a pair that can be judged, found none", code="ground_truth_missing", field="data"
         )
     return Examples(*(np.stack([one[k] for one in examples]) for k in range(len(Example._fields))))
-
-
-def truth_of(ground_truth: GroundTruthFolder, source_timestamp_ns: int) -> Uint8Array:
-    """[H, W] bits of one frame: ``MOVING``, ``IGNORED`` and ``SEAM``."""
-    pixels = labels_of(ground_truth, source_timestamp_ns).pixels
-    assert pixels is not None
-    instances = ground_truth.instances(source_timestamp_ns)
-    truth = np.where(pixels.moving, MOVING, 0).astype(np.uint8)
-    truth[pixels.ignored] = IGNORED
-    block = np.ones((2 * SEAM_REACH_PX + 1,) * 2, np.uint8)
-    for thing in np.unique(instances[instances > 0]):
-        itself = instances == thing
-        near = cv2.dilate(itself.astype(np.uint8), block) != 0
-        truth[near & ~itself & pixels.moving] |= SEAM
-    return truth
-
-
-def offsets_of(instances: Uint8Array, blocks: tuple[int, ...]) -> Bytes:
-    """[2, h, w] blocks (y, x) from each block to the middle of the thing at its own middle; 0 where there is none.
-
-    Args:
-        instances: [H, W] numbers of things, 0 is none.
-        blocks: h and w, of the padded image.
-    """
-    offsets = np.zeros((2, *blocks), dtype=np.int8)
-    middle = EVIDENCE_BLOCK_PX // 2
-    owners = instances[middle::EVIDENCE_BLOCK_PX, middle::EVIDENCE_BLOCK_PX]
-    for thing in np.unique(owners[owners > 0]):
-        pixels, mine = np.nonzero(instances == thing), np.nonzero(owners == thing)
-        for axis in range(2):
-            centre = (pixels[axis].mean() + 0.5) / EVIDENCE_BLOCK_PX - 0.5
-            offsets[axis][mine] = np.clip(np.rint(centre - mine[axis]), -MAX_OFFSET_BLOCKS, MAX_OFFSET_BLOCKS)
-    return offsets
 
 
 def _as_bytes(cues: Float32Array) -> Uint8Array:
@@ -151,6 +116,7 @@ def kept_examples(
     Raises:
         DatasetError: as ``extract_examples``; ``evidence_data_malformed`` for a file there that is none of these.
     """
+    detector = _at_size(detector, path, augment)
     kept, about = folder / f"{path.name}.npz", _made_with(detector, path, every, augment)
     if kept.exists():
         examples = _read_kept(kept, about)
@@ -161,6 +127,13 @@ def kept_examples(
     np.savez(buffer, about=np.array(about), **{name: getattr(examples, name) for name in Example._fields})
     write_atomically(kept, buffer.getvalue())
     return examples
+
+
+def _at_size(detector: AnomalyDetector, path: Path, augment: Augment) -> AnomalyDetector:
+    """The detector as it judges this recording: at its internal size or, for the recordings drawn, with all pixels."""
+    if not augment.at_own_size(path.name):
+        return detector
+    return detector.with_config(detector.config.model_copy(update={"internal_short_side_px": 0}))
 
 
 def _made_with(detector: AnomalyDetector, path: Path, every: int, augment: Augment) -> str:
@@ -174,6 +147,7 @@ def _made_with(detector: AnomalyDetector, path: Path, every: int, augment: Augme
         "correction": config.correction.model_dump(mode="json"),
         "softening": config.regions.texture_softening_gray,
         "residual": (config.residual, config.photometric_compensation),
+        "internal_short_side_px": config.internal_short_side_px,
         "every": every,
         "files": hashlib.sha256(json.dumps(files).encode()).hexdigest(),
     }

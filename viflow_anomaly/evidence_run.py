@@ -92,7 +92,7 @@ def train_evidence(
             data,
             out_dir / "cues",
             every=training.every,
-            augment=Augment(training.seed, training.augmented_share),
+            augment=Augment(training.seed, training.augmented_share, training.own_size_share),
             on_progress=lambda done, total: report("reading", done, total),
         )
         _run_steps(run, EvidenceData(examples, training), out_dir, fingerprint, report)

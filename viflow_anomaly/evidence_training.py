@@ -17,12 +17,15 @@ from torch import nn
 from viflow_anomaly.checkpoint import save_training_state
 from viflow_anomaly.config import EVIDENCE_BLOCK_PX, EvidenceTrainingConfig
 from viflow_anomaly.errors import ConfigError
-from viflow_anomaly.evidence_data import IGNORED, MOVING, SEAM, EvidenceBatch, EvidenceData
+from viflow_anomaly.evidence_data import EvidenceBatch, EvidenceData
+from viflow_anomaly.evidence_truth import IGNORED, MOVING, SEAM, SIZE_SHIFT
 from viflow_anomaly.model.evidence_builder import build_evidence_head
 from viflow_anomaly.model.evidence_head import OFFSET_SCALE_BLOCKS, EvidenceHead
 from viflow_anomaly.training_state import learning_rate, resume_state, state_tensors
 
 Fingerprint = dict[str, object]
+BALANCED_AREA_PX = 1024.0
+MAX_BALANCE = 4.0
 
 
 class EvidenceTraining:
@@ -57,9 +60,8 @@ class EvidenceTraining:
         cues = (torch.from_numpy(one).to(self.device) for one in (batch.photometric, batch.geometric))
         logits, offsets = self.network(*(one.contiguous(memory_format=torch.channels_last) for one in cues))
         truth = torch.from_numpy(batch.truth).to(self.device)
-        loss = evidence_loss(
-            logits, truth, motion_weight=self.config.motion_weight, seam_weight=self.config.seam_weight
-        )
+        weights = {name: getattr(self.config, name) for name in ("motion_weight", "size_balance", "seam_weight")}
+        loss = evidence_loss(logits, truth, **weights)
         true_offsets = torch.from_numpy(batch.offsets).to(self.device)
         loss = loss + self.config.offset_weight * offset_loss(offsets, true_offsets, truth)
         value = float(loss.detach())
@@ -92,26 +94,37 @@ class EvidenceTraining:
 
 
 def evidence_loss(
-    logits: torch.Tensor, truth: torch.Tensor, *, motion_weight: float, seam_weight: float
+    logits: torch.Tensor, truth: torch.Tensor, *, motion_weight: float, seam_weight: float, size_balance: float = 0.0
 ) -> torch.Tensor:
     """Binary cross-entropy of motion, half its Dice loss, and cross-entropy of seams among moving pixels.
+
+    A region counts once, whatever its size; with ``size_balance`` the pixels of movers under ``BALANCED_AREA_PX`` weigh
+    more, by that power of what they are short of (at most ``MAX_BALANCE`` times as much).
 
     Args:
         logits: [B, 2, H, W] of motion and of seam.
         truth: [B, H, W] uint8 bits (``evidence_data``); what is ignored does not count.
         motion_weight: of a moving pixel's cross-entropy.
         seam_weight: of the last term.
+        size_balance: 0: all moving pixels weigh alike.
     """
     judged = ((truth & IGNORED) == 0).float()
     moving, seam = ((truth & MOVING) != 0).float(), ((truth & SEAM) != 0).float()
     weight = logits.new_tensor(motion_weight)
     motion = F.binary_cross_entropy_with_logits(logits[:, 0], moving, reduction="none", pos_weight=weight)
+    motion = motion * torch.where(moving > 0, _balance(truth, size_balance), 1.0)
     cross_entropy = (motion * judged).sum() / judged.sum().clamp(min=1)
     probability = torch.sigmoid(logits[:, 0]) * judged
     shared, total = (probability * moving).sum(), probability.sum() + (judged * moving).sum()
     dice = 1 - (2 * shared + 1) / (total + 1)
     seams = F.binary_cross_entropy_with_logits(logits[:, 1], seam, reduction="none", pos_weight=weight)
     return cross_entropy + 0.5 * dice + seam_weight * (seams * moving).sum() / moving.sum().clamp(min=1)
+
+
+def _balance(truth: torch.Tensor, power: float) -> torch.Tensor:
+    """What the pixels of a mover weigh more for its smallness."""
+    area_px = torch.exp2((truth >> SIZE_SHIFT).float())
+    return (BALANCED_AREA_PX / area_px).clamp(min=1).pow(power).clamp(max=MAX_BALANCE)
 
 
 def offset_loss(offsets: torch.Tensor, true_offsets: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:

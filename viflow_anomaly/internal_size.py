@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -83,6 +83,12 @@ class InternalSize(NamedTuple):
     def mask(self, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """[height, width] -> [source_height, source_width]."""
         return inside[np.ix_(*self._at(BoundingBox(0, 0, self.source_width, self.source_height)))]
+
+    def thin_out(self, values: NDArray[Any]) -> NDArray[Any]:
+        """[source_height, source_width] -> [height, width]: what holds at each internal pixel's middle."""
+        rows = (2 * np.arange(self.height) + 1) * self.source_height // (2 * self.height)
+        columns = (2 * np.arange(self.width) + 1) * self.source_width // (2 * self.width)
+        return values[np.ix_(rows, columns)]
 
     def coordinates(self, target_px: Float32Array) -> Float32Array:
         """[height, width, 2] positions in the internal target -> [source_height, source_width, 2] in the source's."""

@@ -56,19 +56,21 @@ def require_our_cues(record: EvidenceRecord) -> None:
         )
 
 
-def expects_head(head: LoadedEvidence | None, model: ModelConfig, config: DetectorConfig) -> bool:
-    """``takes_head`` before a pair is seen: of the networks the calibrated one knows depth, where it is corrected."""
+def takes_head(head: LoadedEvidence | None, config: DetectorConfig, *, knows_depth: bool) -> bool:
+    """Whether the head judges a pair: "auto" wants a network that knows depth, as the head was trained on."""
     if head is None or config.evidence == "residual":
         return False
-    return config.evidence == "learned" or (model.preset == "calibrated" and config.correction.enabled)
+    return config.evidence == "learned" or knows_depth
 
 
-def takes_head(head: LoadedEvidence | None, predicted: PredictedFlow, config: DetectorConfig) -> bool:
-    """Whether the head judges this pair: "auto" wants a network that knows depth, as the head was trained on."""
-    if head is None or config.evidence == "residual":
-        return False
-    correction = predicted.correction
-    return config.evidence == "learned" or (correction is not None and correction.motion is not None)
+def will_know_depth(model: ModelConfig, config: DetectorConfig) -> bool:
+    """Before a pair is seen: of the networks the calibrated one knows depth, where it is corrected."""
+    return model.preset == "calibrated" and config.correction.enabled
+
+
+def knows_depth(predicted: PredictedFlow) -> bool:
+    """What a network said of a pair comes of depth and a camera's motion."""
+    return predicted.correction is not None and predicted.correction.motion is not None
 
 
 def judge_cues(head: LoadedEvidence, cues: EvidenceCues, explanation: Explanation) -> JudgedCues:
