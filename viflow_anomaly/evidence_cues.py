@@ -38,7 +38,7 @@ GEOMETRIC_CUES = (
     "local flow along",
     "remaining depth",
 )
-CUES_VERSION = 2
+CUES_VERSION = 3
 """Raised when a head that was trained before must not judge them; kept cues are made anew then. Delete them after any
 smaller change of their arithmetic."""
 HALF_GRAY, HALF_NORMALISED_GRAY, HALF_MISMATCH_GRAY = 16.0, 8.0, 8.0
