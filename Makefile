@@ -36,8 +36,8 @@ MODEL_THREADS ?= 1
 MODEL_TRAINING := --set model.preset=calibrated --set training.learning_rate=0.0015 --set training.warmup_steps=200 \
   --set training.validate_every=5000
 HEAD_STEPS ?= 12000
-# Empty: from fresh weights (14000 steps and learning rate 0.002 then suit).
-HEAD_INIT ?= --init default
+# Whose bundled head the training begins with.
+HEAD_INIT_COMMIT ?= d16f3511d55d
 HEAD_THREADS ?= 2
 REPRODUCTION_DIR ?= runs/reproduction
 HELD_OUT_SEQUENCES ?= 12
@@ -145,8 +145,13 @@ head: held-out
 	simulate car 87000 12 6 head-calibration --set simulator.width=1242 --set simulator.height=375 \
 	  --set simulator.foliage=60; \
 	simulate car 87100 12 6 head-calibration --set simulator.width=1242 --set simulator.height=375
+	mkdir -p $(MODEL_DIR)/head-init
+	for kind in safetensors json; do \
+	  git show $(HEAD_INIT_COMMIT):viflow_anomaly/weights/viflow-evidence.$$kind >$(MODEL_DIR)/head-init/head.$$kind; \
+	done
 	$(BIN)/viflow-anomaly train-evidence $(MODEL_DIR)/head/* --calibration $(MODEL_DIR)/head-calibration \
-	  --out $(MODEL_DIR)/head-run --resume $(HEAD_INIT) --steps $(HEAD_STEPS) --threads $(HEAD_THREADS)
+	  --out $(MODEL_DIR)/head-run --resume \
+	  --init $(MODEL_DIR)/head-init/head.safetensors --steps $(HEAD_STEPS) --threads $(HEAD_THREADS)
 	$(BIN)/viflow-anomaly export --evidence-head $(MODEL_DIR)/head-run/evidence.safetensors
 	for kind in safetensors json onnx; do cp $(MODEL_DIR)/head-run/evidence.$$kind viflow_anomaly/weights/viflow-evidence.$$kind; done
 	$(MAKE) --no-print-directory evaluate

@@ -77,12 +77,12 @@ def test_what_is_ignored_costs_nothing() -> None:
     logits = torch.zeros(1, 2, 8, 8)
     truth = torch.zeros(1, 8, 8, dtype=torch.uint8)
     truth[0, :4] = MOVING
-    before = evidence_loss(logits, truth, motion_weight=3.0, seam_weight=0.3)
+    before = evidence_loss(logits, truth, motion_weight=3.0, size_balance=0.0, seam_weight=0.3)
     wrong, ignored = logits.clone(), truth.clone()
     wrong[0, 0, 4:] = 9.0
     ignored[0, 4:] = IGNORED
-    assert float(evidence_loss(wrong, truth, motion_weight=3.0, seam_weight=0.3)) > float(before) + 1
-    loss = evidence_loss(wrong, ignored, motion_weight=3.0, seam_weight=0.3)
+    assert float(evidence_loss(wrong, truth, motion_weight=3.0, size_balance=0.0, seam_weight=0.3)) > float(before) + 1
+    loss = evidence_loss(wrong, ignored, motion_weight=3.0, size_balance=0.0, seam_weight=0.3)
     assert float(loss) == pytest.approx(3.0 * np.log(2) + 0.5 * (1 - 33 / 49) + 0.3 * np.log(2), rel=1e-5)
 
 
@@ -90,11 +90,13 @@ def test_seams_count_where_something_moves() -> None:
     logits, truth = torch.zeros(1, 2, 8, 8), torch.zeros(1, 8, 8, dtype=torch.uint8)
     truth[0, :4], truth[0, 3] = MOVING, MOVING | SEAM
     logits[0, 1, 3], logits[0, 1, :3] = 9.0, -9.0
-    right = evidence_loss(logits, truth, motion_weight=1.0, seam_weight=1.0)
+    right = evidence_loss(logits, truth, motion_weight=1.0, size_balance=0.0, seam_weight=1.0)
     logits[0, 1, 4:] = 9.0  # where nothing moves a seam means nothing
-    assert float(evidence_loss(logits, truth, motion_weight=1.0, seam_weight=1.0)) == pytest.approx(float(right))
+    assert float(evidence_loss(logits, truth, motion_weight=1.0, size_balance=0.0, seam_weight=1.0)) == pytest.approx(
+        float(right)
+    )
     logits[0, 1, 3] = -9.0
-    assert float(evidence_loss(logits, truth, motion_weight=1.0, seam_weight=1.0)) > float(right) + 1
+    assert float(evidence_loss(logits, truth, motion_weight=1.0, size_balance=0.0, seam_weight=1.0)) > float(right) + 1
 
 
 def test_pixels_of_small_movers_weigh_more() -> None:
@@ -123,7 +125,11 @@ def test_offsets_count_where_something_moves() -> None:
 
 def test_a_frame_without_movers_has_a_loss() -> None:
     loss = evidence_loss(
-        torch.zeros(1, 2, 8, 8), torch.zeros(1, 8, 8, dtype=torch.uint8), motion_weight=3, seam_weight=1
+        torch.zeros(1, 2, 8, 8),
+        torch.zeros(1, 8, 8, dtype=torch.uint8),
+        motion_weight=3,
+        size_balance=0.0,
+        seam_weight=1,
     )
     assert bool(torch.isfinite(loss))
 

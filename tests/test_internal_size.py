@@ -109,6 +109,17 @@ def test_positions_come_back_in_source_pixels(width: int, height: int) -> None:
     assert size.map(np.full((size.height, size.width), 3.0, np.float32)).shape == (height, width)
 
 
+@pytest.mark.parametrize(("width", "height"), [(752, 480), (1242, 375), (2001, 1501)])
+def test_what_is_thinned_out_is_of_the_middles(width: int, height: int) -> None:
+    size = internal_size(width, height, 240)
+    assert size is not None
+    rows, columns = (size.thin_out(positions) for positions in np.indices((height, width)))
+    for kept, step in ((rows[:, 0], size.step_px[1]), (columns[0], size.step_px[0])):
+        assert np.abs(kept + 0.5 - (np.arange(kept.size) + 0.5) * step).max() <= 0.5
+    numbers = np.arange(size.width * size.height).reshape(size.height, size.width)
+    np.testing.assert_array_equal(size.thin_out(size.mask(numbers)), numbers)
+
+
 @pytest.fixture(scope="module")
 def sample() -> FramePair:
     files = PairFiles(*(SAMPLE / name for name in ("source.png", "target.png", "imu.json", "camera.json")))

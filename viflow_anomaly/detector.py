@@ -249,7 +249,7 @@ class AnomalyDetector:
         """
         model = self._record.model
         takes_part = for_head or takes_head(
-            self._evidence, self.config, knows_depth=will_know_depth(model, self.config)
+            self._evidence, self.config, depth_is_known=will_know_depth(model, self.config)
         )
         if model.view.mode == "center_crop" or not takes_part:
             return None
@@ -322,7 +322,7 @@ class AnomalyDetector:
         model_input = prepare(pair, self._record.model)
         focal_px = self._record.model.view.focal_px
         predicted = predict_flow(self._runtime, model_input, self.config.correction, focal_px=focal_px)
-        if not for_head and not takes_head(self._evidence, self.config, knows_depth=knows_depth(predicted)):
+        if not for_head and not takes_head(self._evidence, self.config, depth_is_known=knows_depth(predicted)):
             return explain(pair, model_input, predicted, self.config), None
         alignment = align(pair, model_input, predicted, focal_px=focal_px)
         coordinates = alignment.target_coordinates

@@ -2,7 +2,7 @@
 
 Cues are those that the detector itself computes, errors of its own network included; the truth is the simulator's masks
 of what moves. Extracting them takes longer than a look at them, so they are kept: ``NAME.npz`` below the training's
-folder holds ``photometric``, ``geometric`` (-1..1 as 0..255) and ``truth`` of every pair of one recording.
+folder holds ``photometric``, ``geometric`` (-1..1 as 0..255), ``truth`` and ``offsets`` of every pair of one recording.
 """
 
 from __future__ import annotations

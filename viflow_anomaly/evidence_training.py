@@ -25,7 +25,9 @@ from viflow_anomaly.training_state import learning_rate, resume_state, state_ten
 
 Fingerprint = dict[str, object]
 BALANCED_AREA_PX = 1024.0
+"""Pixels of movers of this size and above weigh ``motion_weight``, of smaller ones more..."""
 MAX_BALANCE = 4.0
+"""...up to so many times as much."""
 
 
 class EvidenceTraining:
@@ -94,19 +96,19 @@ class EvidenceTraining:
 
 
 def evidence_loss(
-    logits: torch.Tensor, truth: torch.Tensor, *, motion_weight: float, seam_weight: float, size_balance: float = 0.0
+    logits: torch.Tensor, truth: torch.Tensor, *, motion_weight: float, seam_weight: float, size_balance: float
 ) -> torch.Tensor:
     """Binary cross-entropy of motion, half its Dice loss, and cross-entropy of seams among moving pixels.
 
-    A region counts once, whatever its size; with ``size_balance`` the pixels of movers under ``BALANCED_AREA_PX`` weigh
-    more, by that power of what they are short of (at most ``MAX_BALANCE`` times as much).
+    In the cross-entropy the pixels of movers under ``BALANCED_AREA_PX`` weigh more: a region counts
+    once, whatever its size.
 
     Args:
         logits: [B, 2, H, W] of motion and of seam.
-        truth: [B, H, W] uint8 bits (``evidence_data``); what is ignored does not count.
+        truth: [B, H, W] uint8 bits (``evidence_truth``); what is ignored does not count.
         motion_weight: of a moving pixel's cross-entropy.
         seam_weight: of the last term.
-        size_balance: 0: all moving pixels weigh alike.
+        size_balance: power of what a small mover's area is short of that its pixels weigh more by; 0: all weigh alike.
     """
     judged = ((truth & IGNORED) == 0).float()
     moving, seam = ((truth & MOVING) != 0).float(), ((truth & SEAM) != 0).float()

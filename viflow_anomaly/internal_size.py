@@ -86,8 +86,8 @@ class InternalSize(NamedTuple):
 
     def thin_out(self, values: NDArray[Any]) -> NDArray[Any]:
         """[source_height, source_width] -> [height, width]: what holds at each internal pixel's middle."""
-        rows = (2 * np.arange(self.height) + 1) * self.source_height // (2 * self.height)
-        columns = (2 * np.arange(self.width) + 1) * self.source_width // (2 * self.width)
+        rows = _holding(np.arange(self.height), self.height, self.source_height)
+        columns = _holding(np.arange(self.width), self.width, self.source_width)
         return values[np.ix_(rows, columns)]
 
     def coordinates(self, target_px: Float32Array) -> Float32Array:
@@ -102,9 +102,14 @@ class InternalSize(NamedTuple):
         rows = np.arange(box.y, box.y + box.height)
         columns = np.arange(box.x, box.x + box.width)
         return (
-            (2 * rows + 1) * self.height // (2 * self.source_height),
-            (2 * columns + 1) * self.width // (2 * self.source_width),
+            _holding(rows, self.source_height, self.height),
+            _holding(columns, self.source_width, self.width),
         )
+
+
+def _holding(pixels: IndexArray, side: int, other_side: int) -> IndexArray:
+    """Of pixels of a side, those of the other side that their middles lie in; of two that touch there the second."""
+    return (2 * pixels + 1) * other_side // (2 * side)
 
 
 def _first_pixel(edge: int, source_side: int, side: int) -> int:

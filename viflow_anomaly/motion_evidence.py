@@ -56,11 +56,11 @@ def require_our_cues(record: EvidenceRecord) -> None:
         )
 
 
-def takes_head(head: LoadedEvidence | None, config: DetectorConfig, *, knows_depth: bool) -> bool:
+def takes_head(head: LoadedEvidence | None, config: DetectorConfig, *, depth_is_known: bool) -> bool:
     """Whether the head judges a pair: "auto" wants a network that knows depth, as the head was trained on."""
     if head is None or config.evidence == "residual":
         return False
-    return config.evidence == "learned" or knows_depth
+    return config.evidence == "learned" or depth_is_known
 
 
 def will_know_depth(model: ModelConfig, config: DetectorConfig) -> bool:

@@ -31,9 +31,8 @@ from viflow_anomaly.regions import (
 from viflow_anomaly.sensor_data import Float64Array
 from viflow_anomaly.shape_rule import Shape, ShapeLimits, judge_shape, thickness_px
 
-SEAM_LOGIT = -0.5
-"""A component is cut where a seam is a little less likely than none: two things that stay one are lost for good, and of
-a thing that is cut for nothing the larger part often still counts."""
+SEAM_LOGIT = 0.0
+"""Where a seam is as likely as none."""
 SEAM_REACH_PX = 5
 """Pixels of a seam go to the component that is nearest, within so many pixels."""
 MAX_LOGIT = 8.0
