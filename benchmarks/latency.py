@@ -42,7 +42,7 @@ from viflow_anomaly.evidence_cues import evidence_cues
 from viflow_anomaly.explanation import explain
 from viflow_anomaly.geometry import Float32Array, pixel_grid, unproject_pixels
 from viflow_anomaly.model_input import prepare
-from viflow_anomaly.motion_evidence import judge_cues, regions_of, takes_head
+from viflow_anomaly.motion_evidence import judge_cues, knows_depth, regions_of, takes_head
 from viflow_anomaly.prediction import correct
 from viflow_anomaly.runtime.loading import load_evidence, load_runtime
 from viflow_anomaly.sensor_data import Frame, FramePair, PinholeCamera, Uint8Array
@@ -128,7 +128,7 @@ class Stages:
         focal_px = self._record.model.view.focal_px
         predicted = correct(hypotheses, model_input, self._config.correction, focal_px=focal_px)
         lap()
-        takes = takes_head(self._head, predicted, self._config)
+        takes = takes_head(self._head, self._config, depth_is_known=knows_depth(predicted))
         alignment = align(pair, model_input, predicted, focal_px=focal_px) if takes else None
         lap()
         coordinates = None if alignment is None else alignment.target_coordinates
