@@ -17,7 +17,7 @@ from viflow_anomaly.cli.train_evidence import recordings_in
 from viflow_anomaly.config import EvidenceHeadConfig, EvidenceTrainingConfig
 from viflow_anomaly.detector import AnomalyDetector
 from viflow_anomaly.errors import CheckpointError, ConfigError, DatasetError
-from viflow_anomaly.evidence_cues import GEOMETRIC_CUES
+from viflow_anomaly.evidence_cues import CUES_VERSION, GEOMETRIC_CUES
 from viflow_anomaly.evidence_data import EvidenceBatch
 from viflow_anomaly.evidence_run import refit_scores, train_evidence
 from viflow_anomaly.evidence_training import EvidenceTraining, evidence_loss, offset_loss
@@ -174,6 +174,23 @@ def test_a_killed_run_goes_on_to_the_same_weights(tmp_path: Path, detector: Anom
     record = load_evidence_head(whole).record
     assert record.provenance["model"]["sha256"] == detector.model_info.sha256
     assert len(record.region_score.weights) == len(REGION_FEATURES)
+
+
+def test_a_run_goes_on_only_with_the_cues_that_it_began_with(
+    tmp_path: Path, detector: AnomalyDetector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, calibration = [recording(tmp_path / "drone_1")], [recording(tmp_path / "drone_2")]
+    settings = {"calibration": calibration, "training": SMALL.model_copy(update={"steps": 1}), "resume": True}
+    train_evidence(data, tmp_path / "out", detector=easily_moved(detector), **settings)  # type: ignore[arg-type]
+    correction = detector.config.correction.model_copy(update={"rounds": 1})
+    corrected_once = detector.with_config(detector.config.model_copy(update={"correction": correction}))
+    with pytest.raises(ConfigError) as differs:
+        train_evidence(data, tmp_path / "out", detector=corrected_once, **settings)  # type: ignore[arg-type]
+    assert (differs.value.code, differs.value.field) == ("resume_config_differs", "correction")
+    monkeypatch.setattr("viflow_anomaly.evidence_data.CUES_VERSION", CUES_VERSION + 1)
+    with pytest.raises(ConfigError, match=f", {CUES_VERSION + 1}]") as differs:
+        train_evidence(data, tmp_path / "out", detector=easily_moved(detector), **settings)  # type: ignore[arg-type]
+    assert (differs.value.code, differs.value.field) == ("resume_config_differs", "cues")
 
 
 def test_a_training_goes_on_from_a_heads_weights(tmp_path: Path, detector: AnomalyDetector) -> None:

@@ -139,19 +139,26 @@ def _at_size(detector: AnomalyDetector, path: Path, augment: Augment) -> Anomaly
 def _made_with(detector: AnomalyDetector, path: Path, every: int, augment: Augment) -> str:
     """All that the cues of a recording depend on; of the recording itself the names and sizes of its files."""
     files = sorted((str(one.relative_to(path)), one.stat().st_size) for one in path.rglob("*") if one.is_file())
-    config = detector.config
     about = {
-        "model": detector.model_info.sha256,
-        "cues": (PHOTOMETRIC_CUES, GEOMETRIC_CUES, CUES_VERSION),
+        **cues_settings(detector),
         "augment": augment,
-        "correction": config.correction.model_dump(mode="json"),
-        "softening": config.regions.texture_softening_gray,
-        "residual": (config.residual, config.photometric_compensation),
-        "internal_short_side_px": config.internal_short_side_px,
         "every": every,
         "files": hashlib.sha256(json.dumps(files).encode()).hexdigest(),
     }
     return json.dumps(about, sort_keys=True)
+
+
+def cues_settings(detector: AnomalyDetector) -> dict[str, Any]:
+    """What of a detector its cues depend on: its network, their version and the settings that they are made with."""
+    config = detector.config
+    return {
+        "model": detector.model_info.sha256,
+        "cues": (PHOTOMETRIC_CUES, GEOMETRIC_CUES, CUES_VERSION),
+        "correction": config.correction.model_dump(mode="json"),
+        "softening": config.regions.texture_softening_gray,
+        "residual": (config.residual, config.photometric_compensation),
+        "internal_short_side_px": config.internal_short_side_px,
+    }
 
 
 def _read_kept(kept: Path, about: str) -> Examples | None:

@@ -20,7 +20,7 @@ from viflow_anomaly.errors import ConfigError
 from viflow_anomaly.evaluation.labelled_pairs import SimulatedPairs
 from viflow_anomaly.evidence_augmentation import Augment
 from viflow_anomaly.evidence_cues import CUES_VERSION, GEOMETRIC_CUES, PHOTOMETRIC_CUES
-from viflow_anomaly.evidence_data import EvidenceData, load_examples
+from viflow_anomaly.evidence_data import EvidenceData, cues_settings, load_examples
 from viflow_anomaly.evidence_training import EvidenceTraining, Fingerprint
 from viflow_anomaly.region_score_fit import fit_region_score, labelled_regions
 from viflow_anomaly.runtime.loading import LoadedEvidence
@@ -77,7 +77,7 @@ def train_evidence(
     _require_usable(out_dir, resume=resume)
     torch.set_num_threads(training.threads)
     fingerprint: Fingerprint = {
-        "model": detector.model_info.sha256,
+        **cues_settings(detector),
         "evidence_training": training.model_dump(mode="json", exclude={"checkpoint_every"}),
         "init": None if initial is None else initial.record.sha256,
         "data": [path.name for path in data],

@@ -7,7 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeGuard
 
 import torch
 from torch import nn
@@ -123,9 +123,13 @@ def require_same_run(folder: Path, record: Mapping[str, Any], fingerprint: Mappi
 
 def _difference(before: object, now: object) -> str:
     """What the error shows: both values; of lists of names, which may be hundreds long, only what one of them lacks."""
-    if not isinstance(now, list):
+    if not _are_names(now):
         return f"{before}, found {now}"
-    if not isinstance(before, list):
+    if not _are_names(before):
         return f"which its state does not name, found {len(now)}"
     lost, added = ((Counter(one) - Counter(other)).elements() for one, other in ((before, now), (now, before)))
     return f"{len(before)}, found {len(now)}: without {sorted(lost)[:5]}, with {sorted(added)[:5]}"
+
+
+def _are_names(value: object) -> TypeGuard[list[str]]:
+    return isinstance(value, list) and all(isinstance(one, str) for one in value)
