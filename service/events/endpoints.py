@@ -20,7 +20,6 @@ from viflow_anomaly_service.events.openapi import (
     add_events_openapi,
 )
 from viflow_anomaly_service.events.query import (
-    EventPage,
     delivery_not_found,
     read_delivery_page,
     read_event_filter,
@@ -30,16 +29,17 @@ from viflow_anomaly_service.events.query import (
     require_delivery_id,
 )
 from viflow_anomaly_service.live_response import LiveResponse
+from viflow_anomaly_service.paging import Page, cursor_of
+from viflow_anomaly_service.paging_openapi import NDJSON_MEDIA_TYPE
 from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.service_core import ServiceCore
-from viflow_anomaly_service.store.openapi import NDJSON_MEDIA_TYPE
-from viflow_anomaly_service.store.query import cursor_of
 from viflow_anomaly_service.store.record import stored_at_ns
 
 if TYPE_CHECKING:
     from viflow_anomaly_service.events.attach import StoredEvents
     from viflow_anomaly_service.events.delivery_store import Delivery
     from viflow_anomaly_service.events.log import LoggedEvent
+    from viflow_anomaly_service.events.query import EventFilter
     from viflow_anomaly_service.store.keeper import ResultKeeper
 
 EXPORT_ROWS: Final = 500
@@ -62,7 +62,7 @@ def add_events(app: FastAPI, core: ServiceCore) -> None:
     async def export_events(request: Request) -> Response:
         """All events that pass the filters, one JSON object a line."""
         _require_stored(core)
-        page = EventPage(read_event_filter(request.query_params.multi_items()), EXPORT_ROWS)
+        page = Page(read_event_filter(request.query_params.multi_items()), EXPORT_ROWS)
         return StreamingResponse(_export(core, page, await _page(core, page)), media_type=NDJSON_MEDIA_TYPE)
 
     @app.get(
@@ -118,12 +118,14 @@ def _require_stored(core: ServiceCore) -> tuple[ResultKeeper, StoredEvents]:
     return core.keeper, core.events.stored
 
 
-async def _page(core: ServiceCore, page: EventPage) -> tuple[list[LoggedEvent], bool]:
+async def _page(core: ServiceCore, page: Page[EventFilter]) -> tuple[list[LoggedEvent], bool]:
     keeper, stored = _require_stored(core)
     return await keeper.read(partial(stored.events.page, page.filter, page.limit, page.after))
 
 
-async def _export(core: ServiceCore, page: EventPage, first: tuple[list[LoggedEvent], bool]) -> AsyncIterator[bytes]:
+async def _export(
+    core: ServiceCore, page: Page[EventFilter], first: tuple[list[LoggedEvent], bool]
+) -> AsyncIterator[bytes]:
     found, more = first
     while found:
         yield "".join(f"{one.event.body}\n" for one in found).encode()

@@ -6,8 +6,8 @@ from typing import Any, Final
 
 from fastapi import FastAPI
 
-from viflow_anomaly_service.events.query import DELIVERY_ID, DELIVERY_STATES, EVENT_ID, KINDS
-from viflow_anomaly_service.examples import EXAMPLE_FAULTS, SOURCE_NS
+from viflow_anomaly_service.events.query import DELIVERY_ID, DELIVERY_STATES, KINDS
+from viflow_anomaly_service.examples import SOURCE_NS
 from viflow_anomaly_service.openapi_parts import (
     NANOSECONDS,
     OR_NULL,
@@ -21,16 +21,22 @@ from viflow_anomaly_service.openapi_parts import (
     reference,
     set_examples,
 )
-from viflow_anomaly_service.store.openapi import (
-    DETECTION_ID_SCHEMA,
-    EXAMPLE_ID,
-    NDJSON_MEDIA_TYPE,
+from viflow_anomaly_service.paging_openapi import (
+    INTERNAL,
+    ITEM_ID_SCHEMA,
+    NO_STORE,
     STORE_GONE,
-    STREAM_ID,
+    STREAM_ID_SCHEMA,
+    TIME_PARAMETERS,
+    lines_answer,
+    list_faults,
+    order_filter,
+    page_parameters,
+    page_schema,
+    stream_filter,
 )
-from viflow_anomaly_service.store.query import DEFAULT_LIMIT, MAX_CURSOR, MAX_LIMIT, ORDERS
+from viflow_anomaly_service.store.openapi import EXAMPLE_ID
 
-_EVENT_ID: Final[JsonObject] = {"type": "string", "pattern": f"^{EVENT_ID.pattern}$"}
 _DELIVERY_ID: Final[JsonObject] = {
     "type": "string",
     "pattern": f"^{DELIVERY_ID.pattern}$".replace("?P<event>", "").replace("?P<sink>", ""),
@@ -59,10 +65,10 @@ EXAMPLE_EVENT: Final[JsonObject] = {
 EXAMPLE_EVENT_PAGE: Final[JsonObject] = {"events": [EXAMPLE_EVENT], "next_cursor": None}
 EVENT_SCHEMA: Final = closed_object(
     {
-        "event_id": {**_EVENT_ID, "description": "of this message; later ones are greater"},
+        "event_id": {**ITEM_ID_SCHEMA, "description": "of this message; later ones are greater"},
         "kind": {"type": "string", "enum": list(KINDS)},
         "thing_id": {"type": "string", "description": "the same for all events of one track"},
-        "stream_id": STREAM_ID,
+        "stream_id": STREAM_ID_SCHEMA,
         "session_id": {"type": "string"},
         "track_id": {"type": "integer"},
         "timestamp_ns": {**NANOSECONDS, "description": "source frame of the pair that said so (the camera's clock)"},
@@ -73,20 +79,14 @@ EVENT_SCHEMA: Final = closed_object(
         "bbox": closed_object({"x": _PIXELS, "y": _PIXELS, "width": _PIXELS, "height": _PIXELS}),
         "image": closed_object({"width": _PIXELS, "height": _PIXELS}),
         "detection_id": {
-            "anyOf": [DETECTION_ID_SCHEMA, OR_NULL],
+            "anyOf": [ITEM_ID_SCHEMA, OR_NULL],
             "description": "the stored detection that said so; null without a store, and when a stream ends",
         },
         "reason": {"enum": [*_REASONS, None], "description": "of an end; else null"},
     },
     description="Something began to move by itself, goes on, or has ended",
 )
-EVENT_PAGE_SCHEMA: Final = closed_object(
-    {
-        "events": {"type": "array", "items": reference("Event"), "maxItems": MAX_LIMIT},
-        "next_cursor": {"type": ["string", "null"], "description": "for the next page; null on the last one"},
-    },
-    description="Some events",
-)
+EVENT_PAGE_SCHEMA: Final = page_schema("events", "Event", "Some events")
 EXAMPLE_DELIVERY: Final[JsonObject] = {
     "id": f"{EXAMPLE_EVENT['event_id']}.webhook-1f6c0d2b9e57",
     "sink": "webhook-1f6c0d2b9e57",
@@ -116,15 +116,7 @@ DELIVERY_SCHEMA: Final = closed_object(
     },
     description="An event on its way to a webhook or to MQTT",
 )
-DELIVERIES_SCHEMA: Final = closed_object(
-    {
-        "deliveries": {"type": "array", "items": reference("Delivery")},
-        "next_cursor": {"type": ["string", "null"], "description": "for the next page; null on the last one"},
-    },
-    description="Some deliveries",
-)
-_INTERNAL: Final = EXAMPLE_FAULTS[500]
-_NONE: Final[Fault] = ("store_not_configured", "expected a store (VIFLOW_STORE_URL), found none", None)
+DELIVERIES_SCHEMA: Final = page_schema("deliveries", "Delivery", "Some deliveries", limited=False)
 _ONE_PROCESS: Final[Fault] = (
     "streams_need_one_process",
     "expected a store or one process (VIFLOW_WORKERS=1), found 4",
@@ -134,55 +126,41 @@ _WRONG: Final[Fault] = ("parameter_invalid", "kind: expected start or update or 
 _FULL: Final[Fault] = ("event_readers_full", "expected at most 64 readers of events at once, found one more", None)
 _UNKNOWN: Final[Fault] = ("delivery_not_found", "expected the id of a delivery, found '17'", None)
 _NOT_DEAD: Final[Fault] = ("delivery_not_dead", "expected a delivery that is dead, found one that is pending", None)
-_STREAM: Final = parameter("stream", STREAM_ID, "events of this stream")
+_STREAM: Final = stream_filter("events of this stream")
 _FILTERS: Final = [
     _STREAM,
     parameter("kind", {"type": "string", "enum": list(KINDS)}, "of this kind"),
-    parameter("from_ns", NANOSECONDS, "source frame at this time or later (the camera's clock)"),
-    parameter("to_ns", NANOSECONDS, "source frame before this time"),
-    parameter("order", {"type": "string", "enum": list(ORDERS), "default": "desc"}, "newest or oldest first"),
+    *TIME_PARAMETERS,
+    order_filter("newest or oldest first"),
 ]
-_PAGING: Final = [
-    parameter(
-        "limit",
-        {"type": "integer", "minimum": 1, "maximum": MAX_LIMIT, "default": DEFAULT_LIMIT},
-        "at most so many on a page",
-    ),
-    parameter("cursor", {"type": "string", "maxLength": MAX_CURSOR}, "next_cursor of a page with the same filters"),
-]
-_LIST_FAULTS: Final = {422: _WRONG, 500: _INTERNAL, 501: _NONE, 503: STORE_GONE}
-_EXPORT_ANSWER: Final[JsonObject] = {
-    "description": "One Event a line; an answer that breaks off is incomplete",
-    "content": {NDJSON_MEDIA_TYPE: {"schema": {"type": "string"}}},
-}
+_LIST_FAULTS: Final = list_faults(_WRONG)
 _LIVE_ANSWER: Final[JsonObject] = {
     "description": "`id:` is the event_id, `event:` the kind (or `gap`: some are missing), `data:` an Event",
     "content": {"text/event-stream": {"schema": {"type": "string"}}},
 }
 EVENT_PAGE_OPERATION: Final[dict[str, Any]] = {
     "responses": {200: answer("A page", reference("EventPage"), EXAMPLE_EVENT_PAGE), **problems(_LIST_FAULTS)},
-    "openapi_extra": {"parameters": [*_FILTERS, *_PAGING]},
+    "openapi_extra": {"parameters": [*_FILTERS, *page_parameters("at most so many on a page")]},
 }
 EVENT_EXPORT_OPERATION: Final[dict[str, Any]] = {
-    "responses": {200: _EXPORT_ANSWER, **problems(_LIST_FAULTS)},
+    "responses": {200: lines_answer("Event"), **problems(_LIST_FAULTS)},
     "openapi_extra": {"parameters": _FILTERS},
 }
 LIVE_OPERATION: Final[dict[str, Any]] = {
-    "responses": {200: _LIVE_ANSWER, **problems({422: _WRONG, 500: _INTERNAL, 501: _ONE_PROCESS, 503: _FULL})},
+    "responses": {200: _LIVE_ANSWER, **problems({422: _WRONG, 500: INTERNAL, 501: _ONE_PROCESS, 503: _FULL})},
     "openapi_extra": {
-        "parameters": [_STREAM, parameter("Last-Event-ID", _EVENT_ID, "go on behind this event", place="header")]
+        "parameters": [_STREAM, parameter("Last-Event-ID", ITEM_ID_SCHEMA, "go on behind this event", place="header")]
     },
 }
 _STATE: Final = parameter("state", {"type": "string", "enum": list(DELIVERY_STATES)}, "in this state")
-_DELIVERY_PAGING: Final = [_PAGING[0] | {"description": "deliveries of at most so many events"}, _PAGING[1]]
 DELIVERIES_OPERATION: Final[dict[str, Any]] = {
     "responses": {200: answer("A page", reference("DeliveryPage"), EXAMPLE_DELIVERIES), **problems(_LIST_FAULTS)},
-    "openapi_extra": {"parameters": [_STATE, *_DELIVERY_PAGING]},
+    "openapi_extra": {"parameters": [_STATE, *page_parameters("deliveries of at most so many events")]},
 }
 RETRY_OPERATION: Final[dict[str, Any]] = {
     "responses": {
         200: answer("It will be tried at once", reference("Delivery"), EXAMPLE_RETRY),
-        **problems({404: _UNKNOWN, 409: _NOT_DEAD, 500: _INTERNAL, 501: _NONE, 503: STORE_GONE}),
+        **problems({404: _UNKNOWN, 409: _NOT_DEAD, 500: INTERNAL, 501: NO_STORE, 503: STORE_GONE}),
     }
 }
 

@@ -1,4 +1,4 @@
-"""What a client may ask of events: filters, a page, the place where a live stream goes on."""
+"""What a client may ask of events, and the place where a live stream goes on."""
 
 from __future__ import annotations
 
@@ -7,28 +7,22 @@ from dataclasses import dataclass
 from typing import Final, get_args
 
 from viflow_anomaly_service.events.event_rules import EventKind
-from viflow_anomaly_service.problems import Problem
-from viflow_anomaly_service.store.query import (
-    DEFAULT_LIMIT,
-    DETECTION_ID,
-    MAX_LIMIT,
-    ORDERS,
+from viflow_anomaly_service.paging import ITEM_ID, PAGE_PARAMETERS, Page, page_of
+from viflow_anomaly_service.parameters import (
     Order,
     choice_parameter,
-    integer_parameter,
+    order_parameter,
     parameters_once,
-    place_of_cursor,
     stream_parameter,
     time_parameters,
     wrong_parameter,
 )
+from viflow_anomaly_service.problems import Problem
 
 KINDS: Final[tuple[str, ...]] = get_args(EventKind)
 EVENT_FILTER_NAMES: Final = ("stream", "kind", "from_ns", "to_ns", "order")
 DELIVERY_STATES: Final = ("pending", "delivered", "dead")
 DELIVERY_ID: Final = re.compile(r"(?P<event>[0-9a-f]{32})\.(?P<sink>mqtt|webhook-[0-9a-f]{12})", re.ASCII)
-EVENT_ID: Final = DETECTION_ID
-"""Ids of events are made as those of detections are."""
 
 
 @dataclass(frozen=True)
@@ -48,28 +42,10 @@ class EventFilter:
 
 
 @dataclass(frozen=True)
-class EventPage:
-    """One page of what passes the filter, behind the event ``after``."""
-
-    filter: EventFilter
-    limit: int = DEFAULT_LIMIT
-    after: str | None = None
-
-
-@dataclass(frozen=True)
 class DeliveryFilter:
     """Which deliveries; None does not filter."""
 
     state: str | None = None
-
-
-@dataclass(frozen=True)
-class DeliveryPage:
-    """One page of deliveries, oldest event first, behind the one with the id ``after``."""
-
-    filter: DeliveryFilter
-    limit: int
-    after: str | None
 
 
 def read_event_filter(parameters: list[tuple[str, str]]) -> EventFilter:
@@ -81,28 +57,24 @@ def read_event_filter(parameters: list[tuple[str, str]]) -> EventFilter:
     return _filter(parameters_once(parameters, EVENT_FILTER_NAMES))
 
 
-def read_event_page(parameters: list[tuple[str, str]]) -> EventPage:
+def read_event_page(parameters: list[tuple[str, str]]) -> Page[EventFilter]:
     """A page's filter, size and place.
 
     Raises:
         Problem: 422 with the parameter at fault; ``cursor_invalid`` also for a cursor of another filter.
     """
-    given = parameters_once(parameters, (*EVENT_FILTER_NAMES, "limit", "cursor"))
-    chosen, cursor = _filter(given), given.get("cursor")
-    after = None if cursor is None else place_of_cursor(cursor, chosen)
-    return EventPage(chosen, integer_parameter(given, "limit", 1, MAX_LIMIT) or DEFAULT_LIMIT, after)
+    given = parameters_once(parameters, (*EVENT_FILTER_NAMES, *PAGE_PARAMETERS))
+    return page_of(given, _filter(given))
 
 
-def read_delivery_page(parameters: list[tuple[str, str]]) -> DeliveryPage:
-    """A page of deliveries.
+def read_delivery_page(parameters: list[tuple[str, str]]) -> Page[DeliveryFilter]:
+    """A page of deliveries, oldest event first; its limit and place are those of their events.
 
     Raises:
         Problem: 422 with the parameter at fault.
     """
-    given = parameters_once(parameters, ("state", "limit", "cursor"))
-    chosen, cursor = DeliveryFilter(choice_parameter(given, "state", DELIVERY_STATES)), given.get("cursor")
-    after = None if cursor is None else place_of_cursor(cursor, chosen)
-    return DeliveryPage(chosen, integer_parameter(given, "limit", 1, MAX_LIMIT) or DEFAULT_LIMIT, after)
+    given = parameters_once(parameters, ("state", *PAGE_PARAMETERS))
+    return page_of(given, DeliveryFilter(choice_parameter(given, "state", DELIVERY_STATES)))
 
 
 def read_live_stream(parameters: list[tuple[str, str]]) -> str | None:
@@ -122,7 +94,7 @@ def read_last_event_id(text: str | None) -> str | None:
     """
     if not text:
         return None
-    if EVENT_ID.fullmatch(text) is None:
+    if ITEM_ID.fullmatch(text) is None:
         raise wrong_parameter("Last-Event-ID", "the id of an event", text)
     return text
 
@@ -150,5 +122,5 @@ def _filter(given: dict[str, str]) -> EventFilter:
         kind=choice_parameter(given, "kind", KINDS),
         from_ns=from_ns,
         to_ns=to_ns,
-        order="asc" if choice_parameter(given, "order", ORDERS) == "asc" else "desc",
+        order=order_parameter(given),
     )

@@ -14,9 +14,10 @@ from typing import Any, Final
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
+from viflow_anomaly_service.paging import Page
 from viflow_anomaly_service.store.engine import UNTIL, make_engine, migrate, store_url
 from viflow_anomaly_service.store.failures import store_error, store_failures
-from viflow_anomaly_service.store.query import DetectionFilter, PageRequest
+from viflow_anomaly_service.store.query import DetectionFilter
 from viflow_anomaly_service.store.record import Record, StoredDetection, first_id_at
 from viflow_anomaly_service.store.tables import DETECTIONS, EVENTS, LABELS, PROBE, THUMBNAILS
 
@@ -141,7 +142,7 @@ class DetectionStore:
             image: bytes | None = connection.execute(found).scalar_one_or_none()
         return image
 
-    def page(self, request: PageRequest) -> tuple[list[StoredDetection], bool]:
+    def page(self, request: Page[DetectionFilter]) -> tuple[list[StoredDetection], bool]:
         """The detections of a page, and whether there are more; fewer than its limit where their JSON is large."""
         falling = request.filter.order == "desc"
         by = DETECTIONS.c.id.desc() if falling else DETECTIONS.c.id.asc()

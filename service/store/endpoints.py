@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING, Final
 from fastapi import FastAPI, Request, Response
 from fastapi.responses import StreamingResponse
 
+from viflow_anomaly_service.paging import Page
+from viflow_anomaly_service.paging_openapi import NDJSON_MEDIA_TYPE
 from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.service_core import ServiceCore
 from viflow_anomaly_service.store.openapi import (
     EXPORT_OPERATION,
     GET_OPERATION,
-    NDJSON_MEDIA_TYPE,
     PAGE_OPERATION,
     THUMBNAIL_OPERATION,
     add_store_openapi,
 )
 from viflow_anomaly_service.store.query import (
-    PageRequest,
     detection_not_found,
     read_filter,
     read_page,
@@ -56,7 +56,7 @@ def add_detections(app: FastAPI, core: ServiceCore) -> None:
     async def export_detections(request: Request) -> Response:
         """All stored detections that pass the filters, one JSON object a line."""
         keeper, chosen = require_keeper(), read_filter(request.query_params.multi_items())
-        first, _ = await keeper.page(PageRequest(chosen, EXPORT_ROWS))
+        first, _ = await keeper.page(Page(chosen, EXPORT_ROWS))
         return StreamingResponse(keeper.export(chosen, first, rows=EXPORT_ROWS), media_type=NDJSON_MEDIA_TYPE)
 
     @app.get("/detections/{detection_id}", operation_id="getDetection", tags=["detections"], **GET_OPERATION)

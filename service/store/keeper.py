@@ -14,12 +14,13 @@ from sqlalchemy.engine import Connection
 
 from viflow_anomaly.detection import Detection
 from viflow_anomaly_service.metrics import ServiceMetrics
+from viflow_anomaly_service.paging import Page, cursor_of
 from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.settings import ServiceSettings
 from viflow_anomaly_service.store.age_clock import AgeClock, seconds_since_boot
 from viflow_anomaly_service.store.detection_store import DetectionStore
 from viflow_anomaly_service.store.failures import StoreError, store_error
-from viflow_anomaly_service.store.query import DetectionFilter, PageRequest, cursor_of
+from viflow_anomaly_service.store.query import DetectionFilter
 from viflow_anomaly_service.store.record import IdMaker, Record, StoredDetection, record_of
 from viflow_anomaly_service.store.store_threads import StoreThreads
 
@@ -176,7 +177,7 @@ class ResultKeeper:
         """
         return await self.read(lambda: self._store.thumbnail(detection_id))
 
-    async def page(self, request: PageRequest) -> tuple[list[StoredDetection], str | None]:
+    async def page(self, request: Page[DetectionFilter]) -> tuple[list[StoredDetection], str | None]:
         """Detections, and the cursor behind them where there are more.
 
         Raises:
@@ -195,7 +196,7 @@ class ResultKeeper:
         found = first
         while found:
             yield "".join(f"{one.to_json()}\n" for one in found).encode()
-            found, _ = await self.page(PageRequest(chosen, rows, found[-1].id))
+            found, _ = await self.page(Page(chosen, rows, found[-1].id))
 
     async def _committed(self, records: list[Record], along: Along | None) -> None:
         """Once all of them are on the disk; else none is."""

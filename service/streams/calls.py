@@ -9,10 +9,10 @@ from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from typing import Any
 
 from viflow_anomaly_service.models.table import ModelSet
+from viflow_anomaly_service.parameters import STREAM_ID
 from viflow_anomaly_service.problems import Problem
 from viflow_anomaly_service.service_core import ServiceCore
 from viflow_anomaly_service.stage_times import StageClock
-from viflow_anomaly_service.store.query import STREAM_ID
 from viflow_anomaly_service.streams.table import LiveStream
 from viflow_anomaly_service.streams.work import JudgedCall, Reading, StreamWork
 

@@ -29,7 +29,8 @@ from viflow_anomaly_service.openapi_parts import (
     reference,
     set_examples,
 )
-from viflow_anomaly_service.store.openapi import DETECTION_ID_SCHEMA, EXAMPLE_ID, STREAM_ID
+from viflow_anomaly_service.paging_openapi import ITEM_ID_SCHEMA, STREAM_ID_SCHEMA
+from viflow_anomaly_service.store.openapi import EXAMPLE_ID
 from viflow_anomaly_service.streams.schemas import StampedStreamSamples, StreamRequest, StreamSetup
 
 _TEXT: Final[JsonObject] = {"type": "string"}
@@ -45,13 +46,13 @@ _FAULT: Final = closed_object(
 )
 ANSWER_SCHEMA: Final = closed_object(
     {
-        "stream_id": STREAM_ID,
+        "stream_id": STREAM_ID_SCHEMA,
         "session_id": _SESSION,
         "begun": {"type": "boolean", "description": "this call began the stream: nothing of before is remembered"},
         "waiting_frames": {**_COUNT, "description": "frames whose pair waits for IMU samples"},
         "faults": {"type": "array", "items": _FAULT},
         "detection_ids": {
-            "anyOf": [{"type": "array", "items": DETECTION_ID_SCHEMA}, OR_NULL],
+            "anyOf": [{"type": "array", "items": ITEM_ID_SCHEMA}, OR_NULL],
             "description": "under which the detections are stored, in their order; null without a store",
         },
         "detections": {
@@ -64,7 +65,7 @@ ANSWER_SCHEMA: Final = closed_object(
 )
 STATUS_SCHEMA: Final = closed_object(
     {
-        "stream_id": STREAM_ID,
+        "stream_id": STREAM_ID_SCHEMA,
         "session_id": _SESSION,
         "begun_at_ns": {**NANOSECONDS, "description": "Unix time"},
         "model": closed_object({"name": _TEXT, "version": _TEXT}, description="that judges it"),
@@ -203,6 +204,6 @@ def add_streams_openapi(app: FastAPI) -> None:
         for path in ("/streams/{stream_id}", "/streams/{stream_id}/frames"):
             for operation in paths[path].values():
                 (name,) = operation["parameters"]
-                name["schema"] = STREAM_ID
+                name["schema"] = STREAM_ID_SCHEMA
 
     extend_openapi(app, change)

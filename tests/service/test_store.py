@@ -18,11 +18,12 @@ from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
 from viflow_anomaly.errors import ConfigError
+from viflow_anomaly_service.paging import Page
 from viflow_anomaly_service.store import detection_store
 from viflow_anomaly_service.store.detection_store import DetectionStore
 from viflow_anomaly_service.store.engine import make_engine, migrate, store_url
 from viflow_anomaly_service.store.failures import StoreError, store_failures
-from viflow_anomaly_service.store.query import LABELS, DetectionFilter, PageRequest
+from viflow_anomaly_service.store.query import LABELS, DetectionFilter
 from viflow_anomaly_service.store.record import ROW_BYTES, IdMaker, Record, stored_at_ns
 from viflow_anomaly_service.store.tables import METADATA
 
@@ -46,7 +47,7 @@ def pages(store: DetectionStore, chosen: DetectionFilter, limit: int) -> list[li
     found: list[list[str]] = []
     after, more = None, True
     while more:
-        rows, more = store.page(PageRequest(chosen, limit, after))
+        rows, more = store.page(Page(chosen, limit, after))
         found.append([row.id for row in rows])
         after = found[-1][-1] if found[-1] else None
     return found
@@ -111,11 +112,11 @@ def passes(one: Record, chosen: DetectionFilter) -> bool:
 def test_pages_are_stable_while_detections_come_and_go(store: DetectionStore) -> None:
     records = [record(number) for number in range(10)]
     store.add(records)
-    first, more = store.page(PageRequest(DetectionFilter(), 4))
+    first, more = store.page(Page(DetectionFilter(), 4))
     assert more
     store.add([record(99)])
     store.prune(max_age_s=None, max_bytes=6 * records[0].size_bytes)  # the six newest stay
-    second, more = store.page(PageRequest(DetectionFilter(), 4, first[-1].id))
+    second, more = store.page(Page(DetectionFilter(), 4, first[-1].id))
     assert [row.id for row in (*first, *second)] == [one.id for one in records[:4:-1]]
     assert not more
 
@@ -136,7 +137,7 @@ def test_old_detections_are_deleted_with_all_that_is_theirs(store: DetectionStor
     store.add([old, new])
     assert store.prune(max_age_s=1000, max_bytes=None) == 0
     assert store.prune(max_age_s=50, max_bytes=None) == 1
-    assert [row.id for row in store.page(PageRequest(DetectionFilter()))[0]] == [new.id]
+    assert [row.id for row in store.page(Page(DetectionFilter()))[0]] == [new.id]
     engine = make_engine(store_url(empty_store_url))
     with engine.begin() as connection:
         assert connection.execute(sa.text("SELECT count(*) FROM detection_labels")).scalar_one() == 1
@@ -150,9 +151,7 @@ def test_the_oldest_are_deleted_when_there_is_too_much(store: DetectionStore, mo
     limit = 7 * (100 + ROW_BYTES)
     assert store.prune(max_age_s=None, max_bytes=limit + 50) == 13
     assert store.prune(max_age_s=None, max_bytes=limit) == 0
-    assert [row.id for row in store.page(PageRequest(DetectionFilter(order="asc")))[0]] == [
-        one.id for one in records[13:]
-    ]
+    assert [row.id for row in store.page(Page(DetectionFilter(order="asc")))[0]] == [one.id for one in records[13:]]
     assert store.prune(max_age_s=None, max_bytes=1) == 7
 
 
@@ -201,7 +200,7 @@ def test_many_open_an_empty_store_at_once(empty_store_url: str) -> None:
 
     with ThreadPoolExecutor(4) as threads:
         list(threads.map(open_and_add, stores))
-    assert len(stores[0].page(PageRequest(DetectionFilter()))[0]) == 4
+    assert len(stores[0].page(Page(DetectionFilter()))[0]) == 4
     for one in stores:
         one.close()
 

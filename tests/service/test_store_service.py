@@ -33,11 +33,11 @@ from serving_process import ServingProcess, serving_process
 
 from viflow_anomaly.errors import MissingDependencyError
 from viflow_anomaly_service.app import create_app
+from viflow_anomaly_service.paging import Page
 from viflow_anomaly_service.settings import ServiceSettings
 from viflow_anomaly_service.store import keeper as keeper_module
 from viflow_anomaly_service.store.detection_store import DetectionStore
 from viflow_anomaly_service.store.failures import store_error
-from viflow_anomaly_service.store.query import PageRequest
 
 
 @pytest.fixture
@@ -175,7 +175,7 @@ def test_an_export_that_breaks_off_is_no_whole_answer(
         no_store_needed.post_json(json_request(seed=seed))
     whole, read = DetectionStore.page, [0]
 
-    def page(self: DetectionStore, request: PageRequest) -> Any:
+    def page(self: DetectionStore, request: Page[Any]) -> Any:
         read[0] += 1
         if read[0] == 2:
             raise store_error("store_unavailable")
