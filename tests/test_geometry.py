@@ -21,6 +21,7 @@ from viflow_anomaly.geometry import (
     skew,
     so3_exp,
     so3_log,
+    solve_few,
     unproject_pixels,
 )
 from viflow_anomaly.sensor_data import PinholeCamera
@@ -93,6 +94,17 @@ def test_integrate_gyro_applies_body_rates_on_the_right() -> None:
 
 def test_integrate_gyro_of_one_sample_is_no_motion() -> None:
     np.testing.assert_array_equal(integrate_gyro(np.array([5], dtype=np.int64), np.ones((1, 3))), np.eye(3))
+
+
+@given(arrays(np.float64, (6, 6), elements=st.floats(-3, 3)), arrays(np.float64, 6, elements=st.floats(-3, 3)))
+def test_a_few_unknowns_are_solved(factor: np.ndarray, solution: np.ndarray) -> None:
+    matrix = factor @ factor.T + np.eye(6)
+    np.testing.assert_allclose(solve_few(matrix, matrix @ solution), solution, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan])
+def test_what_has_no_solution_is_not_a_number(value: float) -> None:
+    assert np.isnan(solve_few(np.full((6, 6), value), np.ones(6))).all()
 
 
 def test_pixel_grid() -> None:

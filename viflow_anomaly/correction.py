@@ -14,7 +14,7 @@ import numpy as np
 
 from viflow_anomaly.config import CorrectionConfig
 from viflow_anomaly.depth_refinement import Parallax, log_depth_step
-from viflow_anomaly.geometry import Float32Array, so3_exp
+from viflow_anomaly.geometry import Float32Array, so3_exp, solve_few
 from viflow_anomaly.measured_flow import MeasuredFlow
 from viflow_anomaly.sensor_data import Float64Array
 
@@ -322,7 +322,7 @@ def _normal_equations(jacobian: Float32Array, error: Float32Array, weights: Floa
 
 
 def _solved(equations: _NormalEquations, prior: Float64Array, pull: Float64Array) -> Float64Array:
-    return np.asarray(np.linalg.solve(equations.normal + np.diag(prior), equations.gradient + pull))
+    return solve_few(equations.normal + np.diag(prior), equations.gradient + pull)
 
 
 def _measured_turn(equations: _NormalEquations, prior: Float64Array, turned: Float64Array) -> MeasuredTurn:

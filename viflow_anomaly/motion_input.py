@@ -81,10 +81,14 @@ class MotionWindow:
 
 
 class _Signal(NamedTuple):
-    """The samples a window touches: [N] seconds after the source frame (IMU clock), [N, 6] gyro and accelerometer."""
+    """The samples a window touches: [N] seconds after the source frame (IMU clock), [N, 6] gyro and accelerometer.
+
+    ``spacing_s`` is the median between two of them, 0 for a single one.
+    """
 
     times_s: Float64Array
     values: Float64Array
+    spacing_s: float
 
 
 def build_motion_window(pair: FramePair, config: MotionWindowConfig, *, gyro_alone: bool = False) -> MotionWindow:
@@ -105,17 +109,17 @@ def build_motion_window(pair: FramePair, config: MotionWindowConfig, *, gyro_alo
     before_s, after_s = _reach(interval_s, config)
     gyro_alone = gyro_alone and config.axes == "camera" and pair.imu.accel_m_s2 is None
     signal = _touched_samples(pair, -before_s, after_s, gyro_alone=gyro_alone)
-    _require_coverage(signal.times_s, interval_s)
+    _require_coverage(signal, interval_s)
     faults = [
         *check_gyroscope(signal.values[:, :3]),
         *([GYRO_ALONE] if gyro_alone else check_accelerometer(signal.values[:, 3:])),
         *check_spikes(signal.values[:, :3], signal.values[:, 3:]),
         *_check_interval(interval_s),
         *_check_rate(signal.times_s, interval_s),
-        *_check_gaps(signal.times_s, before_s, interval_s),
+        *_check_gaps(signal, before_s, interval_s),
     ]
     if blocks is None:
-        faults += _check_before_window(signal.times_s, before_s)
+        faults += _check_before_window(signal, before_s)
         rows = _resampled_rows(signal, interval_s, config)
     else:
         rows = _paper_rows(signal, interval_s, blocks)
@@ -155,22 +159,22 @@ def _touched_samples(pair: FramePair, start_s: float, end_s: float, *, gyro_alon
     first = max(int(np.searchsorted(times_s, start_s - STAMP_JITTER_S, side="right")) - 1, 0)
     last = int(np.searchsorted(times_s, end_s + STAMP_JITTER_S, side="left")) + 1
     kept = slice(first, last)
-    return _Signal(times_s[kept], np.concatenate([imu.gyro_rad_s[kept], accel_m_s2[kept]], axis=1))
+    times_s = times_s[kept]
+    spacing_s = float(np.median(times_s[1:] - times_s[:-1])) if times_s.size > 1 else 0.0
+    return _Signal(times_s, np.concatenate([imu.gyro_rad_s[kept], accel_m_s2[kept]], axis=1), spacing_s)
 
 
-def _coverage_tolerance_s(times_s: Float64Array) -> float:
+def _coverage_tolerance_s(signal: _Signal) -> float:
     """How far the first and last sample may lie inside a span that still counts as covered.
 
     One and a half sample periods, because the sample just outside the span may be missing and stamps jitter, but never
     more than ``MAX_COVERAGE_TOLERANCE_S``; a single sample covers nothing.
     """
-    if times_s.size < 2:
-        return 0.0
-    return min(1.5 * float(np.median(times_s[1:] - times_s[:-1])), MAX_COVERAGE_TOLERANCE_S)
+    return min(1.5 * signal.spacing_s, MAX_COVERAGE_TOLERANCE_S)
 
 
-def _require_coverage(times_s: Float64Array, interval_s: float) -> None:
-    tolerance_s = _coverage_tolerance_s(times_s)
+def _require_coverage(signal: _Signal, interval_s: float) -> None:
+    times_s, tolerance_s = signal.times_s, _coverage_tolerance_s(signal)
     starts_late = times_s[0] > tolerance_s
     ends_early = times_s[-1] < interval_s - tolerance_s
     if starts_late or ends_early:
@@ -202,13 +206,14 @@ def _check_rate(times_s: Float64Array, interval_s: float) -> list[ImuFault]:
     return [ImuFault("imu_rate_low", message, "lowers_trust")]
 
 
-def _check_gaps(times_s: Float64Array, before_s: float, interval_s: float) -> list[ImuFault]:
+def _check_gaps(signal: _Signal, before_s: float, interval_s: float) -> list[ImuFault]:
     """A gap is a spacing above 15 ms and above 2.5 medians, or above two frame intervals whatever the median says.
 
     Where a gap hides more than half of the frame interval the motion between the frames is unknown: abstain.
     """
-    spacings_s = np.diff(times_s)
-    normal_s = min(GAP_MEDIANS * float(np.median(spacings_s)), GAP_INTERVALS * interval_s)
+    times_s = signal.times_s
+    spacings_s = times_s[1:] - times_s[:-1]
+    normal_s = min(GAP_MEDIANS * signal.spacing_s, GAP_INTERVALS * interval_s)
     touches_window = (times_s[1:] > -before_s) & (times_s[:-1] < interval_s)
     gaps = (spacings_s > max(normal_s, GAP_MIN_S)) & touches_window
     if not gaps.any():
@@ -217,14 +222,14 @@ def _check_gaps(times_s: Float64Array, before_s: float, interval_s: float) -> li
     hides_most = bool((hidden_s[gaps] > 0.5 * interval_s).any())
     message = (
         f"The IMU samples have a gap of {1e3 * float(spacings_s[gaps].max()):.0f} ms; the usual spacing is "
-        f"{1e3 * float(np.median(spacings_s)):.1f} ms and the frames are {1e3 * interval_s:.0f} ms apart."
+        f"{1e3 * signal.spacing_s:.1f} ms and the frames are {1e3 * interval_s:.0f} ms apart."
     )
     return [ImuFault("imu_gap", message, "abstain" if hides_most else "lowers_trust")]
 
 
-def _check_before_window(times_s: Float64Array, before_s: float) -> list[ImuFault]:
-    missing_s = times_s[0] + before_s
-    if missing_s <= _coverage_tolerance_s(times_s):
+def _check_before_window(signal: _Signal, before_s: float) -> list[ImuFault]:
+    missing_s = signal.times_s[0] + before_s
+    if missing_s <= _coverage_tolerance_s(signal):
         return []
     message = (
         f"The window begins {1e3 * before_s:.0f} ms before the source frame, but its first {1e3 * missing_s:.0f} ms "
@@ -247,7 +252,7 @@ def _resampled_rows(signal: _Signal, interval_s: float, config: MotionWindowConf
 
 def _integral_at(edges_s: Float64Array, signal: _Signal) -> Float64Array:
     """[E, 6] integral from the first sample to each edge of the samples joined by straight lines (ends held)."""
-    times_s, values = signal
+    times_s, values = signal.times_s, signal.values
     steps_s = np.diff(times_s)[:, None]
     at_samples = np.zeros_like(values)
     np.cumsum(0.5 * (values[1:] + values[:-1]) * steps_s, axis=0, out=at_samples[1:])

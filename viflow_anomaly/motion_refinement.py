@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viflow_anomaly.geometry import Float32Array
+from viflow_anomaly.geometry import Float32Array, solve_few
 from viflow_anomaly.sensor_data import Float64Array
 
 ROUNDS = 4
@@ -27,6 +27,7 @@ MIN_TOLERANCE_PX = 0.5
 """Errors of this size are half trusted at least; more where most of the picture is off by more."""
 ROTATION_SIGMA_RAD, TRANSLATION_SIGMA = 0.004, 0.05
 """How far the corrected motion may still be off; the translation in the view's unit of length."""
+_PRIOR = np.diag(np.repeat([1 / ROTATION_SIGMA_RAD**2, 1 / TRANSLATION_SIGMA**2], 3))
 NOISE_PX = 1.0
 CORRELATED_BLOCKS = 36.0
 """So many neighbours count as one."""
@@ -77,7 +78,6 @@ def common_motion_px(
     share = 1 / (1 + (parallax / np.float32(FREE_PARALLAX_PX)) ** 2)
     trusted = trust[thin].reshape(-1) * np.float32(pitch**2 / (NOISE_PX**2 * CORRELATED_BLOCKS))
     trusted = np.stack([trusted, trusted * share])
-    prior = np.diag(np.repeat([1 / ROTATION_SIGMA_RAD**2, 1 / TRANSLATION_SIGMA**2], 3))
     solution, middle = np.zeros(6), share.size // 2
     for _ in range(ROUNDS):
         across, along = (goal - solution.astype(np.float32) @ rows).reshape(2, -1)
@@ -85,8 +85,7 @@ def common_motion_px(
         tolerance = max(MIN_TOLERANCE_PX, float(np.partition(size, middle)[middle]))
         robust = 1 / (1 + (size / np.float32(tolerance)) ** 2)
         weighted = rows * (trusted * robust).reshape(-1)
-        normal = prior + (weighted @ rows.T).astype(np.float64)
-        solution = np.asarray(np.linalg.solve(normal, (weighted @ goal).astype(np.float64)))
+        solution = solve_few(_PRIOR + weighted @ rows.T, (weighted @ goal).astype(np.float64))
     return _moved_px(points, solution, focal_px)
 
 
@@ -94,9 +93,9 @@ def _basis_px(points: MovedPoints, focal_px: tuple[float, float]) -> tuple[Float
     """[6, N] each: how flow in pixels along x and along y follows a further rotation and translation of the camera."""
     x, y, nearness = points
     fx, fy = (np.float32(focal) for focal in focal_px)
-    zero = np.zeros_like(x)
-    along_x = np.stack([-x * y, 1 + x * x, -y, nearness, zero, -x * nearness])
-    along_y = np.stack([-1 - y * y, x * y, x, zero, nearness, -y * nearness])
+    along_x, along_y = np.zeros((2, 6, len(x)), dtype=np.float32)
+    along_x[0], along_x[1], along_x[2], along_x[3], along_x[5] = -x * y, 1 + x * x, -y, nearness, -x * nearness
+    along_y[0], along_y[1], along_y[2], along_y[4], along_y[5] = -1 - y * y, x * y, x, nearness, -y * nearness
     along_x *= fx
     along_y *= fy
     return along_x, along_y

@@ -78,10 +78,10 @@ def _parts(own: BoolArray, motion: Float32Array, first: int) -> tuple[int, Label
         if highest < needed:
             break
         above = own & (sampled > np.float32(LEVELS[number]))
-        count, labels, measured, _ = cv2.connectedComponentsWithStats(above.view(np.uint8), connectivity=4)
+        count, labels = cv2.connectedComponents(above.view(np.uint8), connectivity=4)
         if count < 3:
             continue
-        areas = measured[1:, cv2.CC_STAT_AREA]
+        areas = np.bincount(labels.reshape(-1))[1:]
         large = np.flatnonzero((areas * pitch**2 >= MIN_PART_PX) & (areas >= MIN_PART_SHARE * areas.sum())) + 1
         if len(large) < 2:
             continue

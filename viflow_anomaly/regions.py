@@ -214,9 +214,9 @@ def largest_components(
     rank_of_label[kept] = np.arange(kept.size)
     rank = rank_of_label[labels].astype(np.uint16)  # 16 bits: numpy then sorts in linear time
     by_component = np.argsort(rank, kind="stable")
-    ends = np.cumsum(areas_px[kept])[:-1]
-    in_order = by_component[: int(areas_px[kept].sum())]
-    return [Component(y[pixels], x[pixels]) for pixels in np.split(in_order, ends)] if kept.size else []
+    ends = np.cumsum(areas_px[kept]).tolist()
+    pixels = (by_component[first:end] for first, end in zip([0, *ends], ends, strict=False))
+    return [Component(y[some], x[some]) for some in pixels]
 
 
 def _component_labels(y: IndexArray, x: IndexArray, shape: tuple[int, ...], pitch_px: int) -> IndexArray:
