@@ -14,6 +14,7 @@ from viflow_anomaly.cli.options import (
     Checkpoint,
     ConfigFile,
     Device,
+    KeyFile,
     Runtime,
     Threads,
     load_detector,
@@ -48,9 +49,7 @@ def detect(
     url: Annotated[
         str | None, typer.Option(metavar="URL", help="Ask the service there, instead of computing here.")
     ] = None,
-    key_file: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="With --url: a file that holds the API key.")
-    ] = None,
+    key_file: KeyFile = None,
     as_json: AsJson = False,
     checkpoint: Checkpoint = None,
     calibration: Calibration = None,

@@ -1,0 +1,58 @@
+"""``replay``: a recording sent to a live service."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from difference_detector import DifferenceDetector
+from pair_world import Ask, PairFolder
+
+sys.path.append(str(Path(__file__).parents[1] / "service"))
+
+from service_world import LiveServer, live_server
+
+from viflow_anomaly.cli.replay import stream_name
+
+
+@pytest.fixture(scope="module")
+def service() -> Iterator[LiveServer]:
+    with live_server(lambda settings: DifferenceDetector()) as running:
+        yield running
+
+
+def test_a_detection_a_line_and_what_it_came_to(ask: Ask, pair: PairFolder, service: LiveServer) -> None:
+    url = f"http://127.0.0.1:{service.port}"
+    answer = ask(["replay", str(pair.folder), "--url", url, "--speed", "0", "--stream", "kept", "--keep"])
+    assert answer.code == 0
+    found = [json.loads(line) for line in answer.out.splitlines()]
+    assert len(found) == 3
+    assert all(one["rois"][0]["track_id"] is not None for one in found[1:])
+    assert answer.err.splitlines() == [f"4 frames to {url}, stream kept: 3 pairs, in 3 something moves by itself"]
+    assert service.client.get("/streams/kept").json()["received_frames"] == 4
+    again = ask(["replay", str(pair.folder), "--url", url, "--speed", "0", "--stream", "kept"])
+    assert (again.code, again.out) == (0, "")
+    assert again.err.endswith(
+        "0 pairs, in 0 something moves by itself; left out: 1 x frame_duplicate, 3 x frame_out_of_order, "
+        "4 x imu_duplicate\n"
+    )
+    assert service.client.get("/streams/kept").status_code == 404
+
+
+def test_what_is_wrong_is_one_line(ask: Ask, pair: PairFolder, service: LiveServer, tmp_path: Path) -> None:
+    url = f"http://127.0.0.1:{service.port}"
+    assert ask(["replay", str(tmp_path / "none"), "--url", url]).is_refusal("expected a directory")
+    assert ask(["replay", str(pair.folder), "--url", "here"]).is_refusal("expected the address of a service")
+    assert ask(["replay", str(pair.folder), "--url", url, "--stream", "a/b"]).is_refusal("stream")
+    assert ask(["replay", str(pair.folder), "--url", url, "--speed", "-1"]).is_refusal("--speed")
+
+
+@pytest.mark.parametrize(
+    ("recording", "name"),
+    [("V1_01_easy", "V1_01_easy"), ("Monday, hall", "Monday-hall"), ("..", "recording"), ("x" * 90, "x" * 64)],
+)
+def test_a_recordings_name_becomes_a_streams(recording: str, name: str) -> None:
+    assert stream_name(recording) == name

@@ -1,0 +1,97 @@
+"""``viflow-anomaly replay``: a recording, sent to a running service as a camera would send it."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from viflow_anomaly.cli.options import KeyFile
+from viflow_anomaly.cli.progress import stderr_progress
+
+if TYPE_CHECKING:
+    from viflow_anomaly.client import StreamAnswer
+
+LOCAL_SERVICE = "http://127.0.0.1:8000"
+MAX_STREAM_NAME = 64
+
+
+def replay(
+    directory: Annotated[
+        Path, typer.Argument(metavar="DIR", help="EuRoC ASL, KITTI raw, KITTI odometry or the plain layout.")
+    ],
+    url: Annotated[str, typer.Option(metavar="URL", help="Of the service.")] = LOCAL_SERVICE,
+    stream: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Under which the service knows it; default: the recording's name."),
+    ] = None,
+    key_file: KeyFile = None,
+    speed: Annotated[
+        float, typer.Option(min=0, max=1000, help="Times as fast as it was recorded; 0: as fast as answers come.")
+    ] = 1.0,
+    layout: Annotated[
+        str | None, typer.Option("--format", metavar="NAME", help="As of `batch`; default by content.")
+    ] = None,
+    camera: Annotated[str | None, typer.Option(metavar="NAME", help="Which camera, e.g. cam1 or image_03.")] = None,
+    keep: Annotated[bool, typer.Option("--keep", help="Leave the stream in the service at the end.")] = False,
+) -> None:
+    """Send a recording to a service, frame by frame, as its camera and IMU would have sent it.
+
+    Prints a detection a line (ROI JSON) as they come. The service's dashboard shows the stream, and its events begin
+    and end. Needs the extra `client`.
+
+    [bold]Examples[/bold]
+
+      viflow-anomaly replay samples/drone
+
+      viflow-anomaly replay V1_01_easy --url http://10.0.0.7:8000 --key-file key.txt --stream drone7 --speed 0.5
+    """
+    from viflow_anomaly.client import Client, read_api_key
+    from viflow_anomaly.client import replay as send_all
+    from viflow_anomaly.datasets.registry import open_recording
+    from viflow_anomaly.detection import to_json
+
+    recording = open_recording(directory, format=layout, camera=camera)
+    name, counted = stream or stream_name(recording.name), _Counted()
+    key = None if key_file is None else read_api_key(key_file)
+    with stderr_progress() as progress, Client(url, api_key=key) as client:
+        task = progress.add_task(name, total=len(recording))
+        with client.stream(name, camera=recording.camera, keep=keep) as sending:
+            for answer in send_all(recording, sending, speed=speed):
+                for detection in answer:
+                    print(to_json(detection), flush=True)
+                counted.add(answer)
+                progress.advance(task)
+    print(f"{len(recording)} frames to {url}, stream {name}: {counted}", file=sys.stderr)
+
+
+class _Counted:
+    """What a replay came to."""
+
+    def __init__(self) -> None:
+        self._judged = self._moving = 0
+        self._faults: Counter[str] = Counter()
+
+    def add(self, answer: StreamAnswer) -> None:
+        self._judged += len(answer)
+        self._moving += sum(any(roi.label == "independent_motion" for roi in one.rois) for one in answer)
+        self._faults.update(fault.code for fault in answer.faults)
+
+    def __str__(self) -> str:
+        said = f"{self._judged} pairs, in {self._moving} something moves by itself"
+        left_out = ", ".join(f"{count} x {code}" for code, count in sorted(self._faults.items()))
+        return f"{said}; left out: {left_out}" if left_out else said
+
+
+def stream_name(recording: str) -> str:
+    """The recording's name with what a stream's name may not hold replaced."""
+    name = re.sub(r"[^A-Za-z0-9._-]+", "-", recording)[:MAX_STREAM_NAME]
+    return "recording" if not name.strip(".") else name
+
+
+def register(app: typer.Typer) -> None:
+    app.command(no_args_is_help=True)(replay)
