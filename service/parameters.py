@@ -35,7 +35,7 @@ def parameters_once(parameters: list[tuple[str, str]], known: tuple[str, ...]) -
 
 
 def integer_parameter(given: dict[str, str], name: str, least: int, most: int) -> int | None:
-    """Raises Problem 422 ``parameter_invalid``, as all below."""
+    """An integer in these limits; raises Problem 422 ``parameter_invalid``, as do those that follow."""
     text = given.get(name)
     if text is None:
         return None

@@ -188,9 +188,9 @@ def test_a_run_goes_on_only_with_the_cues_that_it_began_with(
         train_evidence(data, tmp_path / "out", detector=corrected_once, **settings)  # type: ignore[arg-type]
     assert (differs.value.code, differs.value.field) == ("resume_config_differs", "correction")
     monkeypatch.setattr("viflow_anomaly.evidence_data.CUES_VERSION", CUES_VERSION + 1)
-    with pytest.raises(ConfigError, match=f", {CUES_VERSION + 1}]") as differs:
+    with pytest.raises(ConfigError, match=f"{CUES_VERSION}, found {CUES_VERSION + 1}") as differs:
         train_evidence(data, tmp_path / "out", detector=easily_moved(detector), **settings)  # type: ignore[arg-type]
-    assert (differs.value.code, differs.value.field) == ("resume_config_differs", "cues")
+    assert (differs.value.code, differs.value.field) == ("resume_config_differs", "cues_version")
 
 
 def test_a_training_goes_on_from_a_heads_weights(tmp_path: Path, detector: AnomalyDetector) -> None:

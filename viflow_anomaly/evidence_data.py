@@ -153,10 +153,12 @@ def cues_settings(detector: AnomalyDetector) -> dict[str, Any]:
     config = detector.config
     return {
         "model": detector.model_info.sha256,
-        "cues": (PHOTOMETRIC_CUES, GEOMETRIC_CUES, CUES_VERSION),
+        "cues": [*PHOTOMETRIC_CUES, *GEOMETRIC_CUES],
+        "cues_version": CUES_VERSION,
         "correction": config.correction.model_dump(mode="json"),
-        "softening": config.regions.texture_softening_gray,
-        "residual": (config.residual, config.photometric_compensation),
+        "texture_softening_gray": config.regions.texture_softening_gray,
+        "residual": config.residual,
+        "photometric_compensation": config.photometric_compensation,
         "internal_short_side_px": config.internal_short_side_px,
     }
 

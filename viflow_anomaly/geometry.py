@@ -48,9 +48,10 @@ def integrate_gyro(timestamps_ns: NDArray[np.int64], gyro_rad_s: Float64Array) -
 
 
 def solve_few(matrix: Float64Array, vector: Float64Array) -> Float64Array:
-    """x [P] of matrix [P, P] x = vector [P], for a handful of unknowns; not a number where there is none.
+    """x [P] of matrix [P, P] x = vector [P], for a handful of unknowns; not a number where there is none, and where a
+    pivot is under about 1e-14.
 
-    OpenCV's elimination, because the one that numpy calls takes ten times as long to begin.
+    OpenCV's elimination, because the one that numpy calls takes several times as long to begin.
     """
     solvable, solution = cv2.solve(matrix, vector[:, None], flags=cv2.DECOMP_LU)
     return np.asarray(solution, dtype=np.float64)[:, 0] if solvable else np.full(len(vector), np.nan)

@@ -7,7 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol, TypeGuard
+from typing import Any, Protocol
 
 import torch
 from torch import nn
@@ -112,24 +112,24 @@ def require_same_run(folder: Path, record: Mapping[str, Any], fingerprint: Mappi
         ConfigError: ``resume_config_differs``.
     """
     for key, value in fingerprint.items():
-        before, now = record.get(key), json.loads(json.dumps(value))
-        if before != now:
+        now = json.loads(json.dumps(value))
+        if key not in record or record[key] != now:
             raise ConfigError(
-                f"{folder}: --resume expects the {key} that the run was started with, {_difference(before, now)}",
+                f"{folder}: --resume expects the {key} that the run was started with, "
+                + (_difference(record[key], now) if key in record else _unnamed(now)),
                 code="resume_config_differs",
                 field=key,
             )
 
 
+def _unnamed(now: object) -> str:
+    """What the error shows where an older version wrote the state."""
+    return f"which its state does not name, found {len(now) if isinstance(now, list) else now}"
+
+
 def _difference(before: object, now: object) -> str:
     """What the error shows: both values; of lists of names, which may be hundreds long, only what one of them lacks."""
-    if not _are_names(now):
+    if not isinstance(before, list) or not isinstance(now, list):
         return f"{before}, found {now}"
-    if not _are_names(before):
-        return f"which its state does not name, found {len(now)}"
     lost, added = ((Counter(one) - Counter(other)).elements() for one, other in ((before, now), (now, before)))
     return f"{len(before)}, found {len(now)}: without {sorted(lost)[:5]}, with {sorted(added)[:5]}"
-
-
-def _are_names(value: object) -> TypeGuard[list[str]]:
-    return isinstance(value, list) and all(isinstance(one, str) for one in value)

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from difference_detector import DifferenceDetector
+from hypothesis import given
+from hypothesis import strategies as st
 from pair_world import Ask, PairFolder
 
 sys.path.append(str(Path(__file__).parents[1] / "service"))
 
 from service_world import LiveServer, live_server
 
-from viflow_anomaly.cli.replay import stream_name
+from viflow_anomaly.cli.replay import _Counted, stream_name
+from viflow_anomaly.client import StreamAnswer
+from viflow_anomaly_service.parameters import STREAM_ID
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +37,7 @@ def test_a_detection_a_line_and_what_it_came_to(ask: Ask, pair: PairFolder, serv
     found = [json.loads(line) for line in answer.out.splitlines()]
     assert len(found) == 3
     assert all(one["rois"][0]["track_id"] is not None for one in found[1:])
-    assert answer.err.splitlines() == [f"4 frames to {url}, stream kept: 3 pairs, in 3 something moves by itself"]
+    assert answer.err.splitlines() == [f"{url}, stream kept: 3 pairs, in 3 something moves by itself"]
     assert service.client.get("/streams/kept").json()["received_frames"] == 4
     again = ask(["replay", str(pair.folder), "--url", url, "--speed", "0", "--stream", "kept"])
     assert (again.code, again.out) == (0, "")
@@ -46,8 +52,33 @@ def test_what_is_wrong_is_one_line(ask: Ask, pair: PairFolder, service: LiveServ
     url = f"http://127.0.0.1:{service.port}"
     assert ask(["replay", str(tmp_path / "none"), "--url", url]).is_refusal("expected a directory")
     assert ask(["replay", str(pair.folder), "--url", "here"]).is_refusal("expected the address of a service")
-    assert ask(["replay", str(pair.folder), "--url", url, "--stream", "a/b"]).is_refusal("stream")
-    assert ask(["replay", str(pair.folder), "--url", url, "--speed", "-1"]).is_refusal("--speed")
+    for name in ("a/b", "..", ""):
+        assert ask(["replay", str(pair.folder), "--url", url, "--stream", name]).is_refusal("expected 1 to 64 of")
+    assert ask(["replay", str(pair.folder), "--url", url, "--speed", "-1"]).is_refusal("expected 0 or 0.001 to 1000")
+
+
+def test_lines_reach_a_pipe_while_a_person_watches_progress(pair: PairFolder, service: LiveServer) -> None:
+    shown, terminal = os.openpty()
+    code = "from viflow_anomaly.cli.main import main; main()"
+    command = [sys.executable, "-c", code, "replay", str(pair.folder), "--url", f"http://127.0.0.1:{service.port}"]
+    done = subprocess.run(
+        command, stdout=subprocess.PIPE, stderr=terminal, check=True, env={**os.environ, "TERM": "xterm"}
+    )
+    os.close(terminal)
+    os.close(shown)
+    assert len(done.stdout.splitlines()) == 3
+
+
+def test_a_stream_that_began_anew_and_answers_that_were_lost_are_told() -> None:
+    counted = _Counted()
+    for begun, lost in ((True, False), (True, False), (False, True)):
+        counted.add(
+            StreamAnswer((), (), session_id="s", begun=begun, waiting_frames=2, detection_ids=None, answer_lost=lost)
+        )
+    assert str(counted) == (
+        "0 pairs, in 0 something moves by itself; frames whose pair waits for IMU samples that the recording lacks: 2; "
+        "the service forgot the stream and began it anew 1 times; answers that were lost on their way: 1"
+    )
 
 
 @pytest.mark.parametrize(
@@ -56,3 +87,9 @@ def test_what_is_wrong_is_one_line(ask: Ask, pair: PairFolder, service: LiveServ
 )
 def test_a_recordings_name_becomes_a_streams(recording: str, name: str) -> None:
     assert stream_name(recording) == name
+
+
+@given(st.text())
+def test_every_name_becomes_one_that_the_service_takes(recording: str) -> None:
+    assert STREAM_ID.fullmatch(stream_name(recording))
+    assert stream_name(stream_name(recording)) == stream_name(recording)

@@ -47,7 +47,7 @@ Device = Annotated[str | None, typer.Option(metavar="DEVICE", help="cpu (default
 Runtime = Annotated[
     str | None, typer.Option(metavar="NAME", help="auto (default), openvino, onnxruntime or torch: docs/runtimes.md.")
 ]
-KeyFile = Annotated[Path | None, typer.Option(metavar="FILE", help="With --url: a file that holds the API key.")]
+KeyFile = Annotated[Path | None, typer.Option(metavar="FILE", help="A file that holds the API key for --url.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on stdout, and nothing else there.")]
 
 

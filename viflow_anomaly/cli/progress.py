@@ -7,7 +7,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 
 def stderr_progress() -> Progress:
-    """A rich progress bar with an item count that stays silent when stderr is not a terminal."""
+    """A rich progress bar with an item count that stays silent when stderr is not a terminal.
+
+    What is printed meanwhile goes where it went before: results belong on stdout.
+    """
     console = Console(stderr=True)
     return Progress(
         TextColumn("{task.description}"),
@@ -17,4 +20,5 @@ def stderr_progress() -> Progress:
         console=console,
         disable=not console.is_terminal,
         transient=True,
+        redirect_stdout=False,
     )

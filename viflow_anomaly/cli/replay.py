@@ -30,9 +30,7 @@ def replay(
         typer.Option(metavar="NAME", help="Under which the service knows it; default: the recording's name."),
     ] = None,
     key_file: KeyFile = None,
-    speed: Annotated[
-        float, typer.Option(min=0, max=1000, help="Times as fast as it was recorded; 0: as fast as answers come.")
-    ] = 1.0,
+    speed: Annotated[float, typer.Option(help="Times as fast as it was recorded; 0: as fast as answers come.")] = 1.0,
     layout: Annotated[
         str | None, typer.Option("--format", metavar="NAME", help="As of `batch`; default by content.")
     ] = None,
@@ -56,41 +54,63 @@ def replay(
     from viflow_anomaly.detection import to_json
 
     recording = open_recording(directory, format=layout, camera=camera)
-    name, counted = stream or stream_name(recording.name), _Counted()
+    name, counted = _required_name(stream) or stream_name(recording.name), _Counted()
     key = None if key_file is None else read_api_key(key_file)
-    with stderr_progress() as progress, Client(url, api_key=key) as client:
-        task = progress.add_task(name, total=len(recording))
-        with client.stream(name, camera=recording.camera, keep=keep) as sending:
-            for answer in send_all(recording, sending, speed=speed):
-                for detection in answer:
-                    print(to_json(detection), flush=True)
-                counted.add(answer)
-                progress.advance(task)
-    print(f"{len(recording)} frames to {url}, stream {name}: {counted}", file=sys.stderr)
+    try:
+        with stderr_progress() as progress, Client(url, api_key=key) as client:
+            task = progress.add_task(name, total=len(recording))
+            with client.stream(name, camera=recording.camera, keep=keep) as sending:
+                for answer in send_all(recording, sending, speed=speed):
+                    for detection in answer:
+                        print(to_json(detection), flush=True)
+                    counted.add(answer)
+                    progress.advance(task)
+    finally:
+        if counted.calls:
+            print(f"{url}, stream {name}: {counted}", file=sys.stderr)
 
 
 class _Counted:
     """What a replay came to."""
 
     def __init__(self) -> None:
-        self._judged = self._moving = 0
-        self._faults: Counter[str] = Counter()
+        self.calls = 0
+        self._judged = self._moving = self._waiting = self._begun = self._lost = 0
+        self._left_out: Counter[str] = Counter()
 
     def add(self, answer: StreamAnswer) -> None:
+        self.calls += 1
         self._judged += len(answer)
         self._moving += sum(any(roi.label == "independent_motion" for roi in one.rois) for one in answer)
-        self._faults.update(fault.code for fault in answer.faults)
+        self._left_out.update(fault.code for fault in answer.faults)
+        self._waiting = answer.waiting_frames
+        self._begun += answer.begun
+        self._lost += answer.answer_lost
 
     def __str__(self) -> str:
-        said = f"{self._judged} pairs, in {self._moving} something moves by itself"
-        left_out = ", ".join(f"{count} x {code}" for code, count in sorted(self._faults.items()))
-        return f"{said}; left out: {left_out}" if left_out else said
+        parts = [f"{self._judged} pairs, in {self._moving} something moves by itself"]
+        if self._left_out:
+            codes = (f"{count} x {code}" for code, count in sorted(self._left_out.items()))
+            parts.append(f"left out: {', '.join(codes)}")
+        if self._waiting:
+            parts.append(f"frames whose pair waits for IMU samples that the recording lacks: {self._waiting}")
+        if self._begun > 1:
+            parts.append(f"the service forgot the stream and began it anew {self._begun - 1} times")
+        if self._lost:
+            parts.append(f"answers that were lost on their way: {self._lost}")
+        return "; ".join(parts)
 
 
 def stream_name(recording: str) -> str:
     """The recording's name with what a stream's name may not hold replaced."""
     name = re.sub(r"[^A-Za-z0-9._-]+", "-", recording)[:MAX_STREAM_NAME]
     return "recording" if not name.strip(".") else name
+
+
+def _required_name(stream: str | None) -> str | None:
+    if stream is not None and stream != stream_name(stream):
+        raise typer.BadParameter(f"expected 1 to 64 of A-Z a-z 0-9 . _ -, found {stream!r}", param_hint="--stream")
+    return stream
 
 
 def register(app: typer.Typer) -> None:

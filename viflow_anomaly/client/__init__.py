@@ -5,7 +5,7 @@ from viflow_anomaly.client.async_calling import AsyncClient
 from viflow_anomaly.client.calling import Client
 from viflow_anomaly.client.encoded_pair import EncodedPair
 from viflow_anomaly.client.live_events import LiveEvent
-from viflow_anomaly.client.replay import replay
+from viflow_anomaly.client.replaying import replay
 from viflow_anomaly.client.retry_policy import RetryPolicy
 from viflow_anomaly.client.service_errors import (
     ServiceBusyError,
