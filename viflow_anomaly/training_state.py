@@ -128,7 +128,10 @@ def _unnamed(now: object) -> str:
 
 
 def _difference(before: object, now: object) -> str:
-    """What the error shows: both values; of lists of names, which may be hundreds long, only what one of them lacks."""
+    """What the error shows: both values, of settings those that differ; of lists of names what one of them lacks."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        differing = [key for key in {**before, **now} if before.get(key) != now.get(key)]
+        before, now = ({key: one.get(key) for key in differing} for one in (before, now))
     if not isinstance(before, list) or not isinstance(now, list):
         return f"{before}, found {now}"
     lost, added = ((Counter(one) - Counter(other)).elements() for one, other in ((before, now), (now, before)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -17,7 +18,7 @@ from pair_world import Ask, PairFolder
 
 sys.path.append(str(Path(__file__).parents[1] / "service"))
 
-from service_world import LiveServer, live_server
+from service_world import LiveServer, live_server, wait_until
 
 from viflow_anomaly.cli.replay import _Counted, stream_name
 from viflow_anomaly.client import StreamAnswer
@@ -40,12 +41,39 @@ def test_a_detection_a_line_and_what_it_came_to(ask: Ask, pair: PairFolder, serv
     assert answer.err.splitlines() == [f"{url}, stream kept: 3 pairs, in 3 something moves by itself"]
     assert service.client.get("/streams/kept").json()["received_frames"] == 4
     again = ask(["replay", str(pair.folder), "--url", url, "--speed", "0", "--stream", "kept"])
-    assert (again.code, again.out) == (0, "")
-    assert again.err.endswith(
-        "0 pairs, in 0 something moves by itself; left out: 1 x frame_duplicate, 3 x frame_out_of_order, "
-        "4 x imu_duplicate\n"
-    )
-    assert service.client.get("/streams/kept").status_code == 404
+    assert again.is_refusal("found that of a stream that goes on there")
+    assert service.client.get("/streams/kept").status_code == 200  # nobody's but the other's to forget
+
+
+def test_what_is_left_out_is_told_once_and_in_the_exit_code(ask: Ask, pair: PairFolder, service: LiveServer) -> None:
+    lines = (pair.folder / "imu.csv").read_text().splitlines()
+    middle = len(lines) // 2
+    (pair.folder / "imu.csv").write_text("\n".join([*lines[: middle + 1], *lines[middle:]]) + "\n")
+    url = f"http://127.0.0.1:{service.port}"
+    answer = ask(["replay", str(pair.folder), "--url", url, "--speed", "0", "--stream", "twice"])
+    assert answer.code == 3
+    told, summary = answer.err.splitlines()
+    assert told.startswith("imu_duplicate_timestamps: timestamps_ns: expected strictly increasing stamps, found ")
+    assert "; left out: 1 x imu_duplicate_timestamps" in summary
+    assert service.client.get("/streams/twice").status_code == 404
+
+
+def test_one_frame_is_no_recording(ask: Ask, pair: PairFolder, service: LiveServer) -> None:
+    lines = (pair.folder / "frames.csv").read_text().splitlines()
+    (pair.folder / "frames.csv").write_text("\n".join(lines[:2]) + "\n")
+    answer = ask(["replay", str(pair.folder), "--url", f"http://127.0.0.1:{service.port}"])
+    assert answer.is_refusal("expected at least 2 frames, found 1")
+
+
+def test_a_terminated_replay_has_its_stream_forgotten(pair: PairFolder, service: LiveServer) -> None:
+    code = "from viflow_anomaly.cli.main import main; main()"
+    place = ["--url", f"http://127.0.0.1:{service.port}", "--stream", "ended", "--speed", "0.002"]
+    command = [sys.executable, "-c", code, "replay", str(pair.folder), *place]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as running:
+        wait_until(lambda: service.client.get("/streams/ended").status_code == 200, seconds=60)
+        running.terminate()
+        assert running.wait(timeout=60) == 128 + signal.SIGTERM
+    assert service.client.get("/streams/ended").status_code == 404
 
 
 def test_what_is_wrong_is_one_line(ask: Ask, pair: PairFolder, service: LiveServer, tmp_path: Path) -> None:
@@ -76,8 +104,8 @@ def test_a_stream_that_began_anew_and_answers_that_were_lost_are_told() -> None:
             StreamAnswer((), (), session_id="s", begun=begun, waiting_frames=2, detection_ids=None, answer_lost=lost)
         )
     assert str(counted) == (
-        "0 pairs, in 0 something moves by itself; frames whose pair waits for IMU samples that the recording lacks: 2; "
-        "the service forgot the stream and began it anew 1 times; answers that were lost on their way: 1"
+        "0 pairs, in 0 something moves by itself; 2 frames wait for IMU samples that did not come; "
+        "the service forgot the stream and began it anew 1 times; 1 answers were lost on their way"
     )
 
 

@@ -347,6 +347,9 @@ def test_the_asynchronous_one_tries_again_and_gives_up_alike() -> None:
         "http://x:99999",
         "http://x?y",
         "http://x/#y",
+        "http://a..b:80",
+        f"http://{'a' * 64}.example",
+        "http://127.0.0.1:8000/\n",
     ],
 )
 def test_an_address_must_be_one(url: str) -> None:
@@ -359,6 +362,14 @@ def test_an_address_holds_no_password() -> None:
     with pytest.raises(ConfigError) as caught:
         Client("http://me:geheim@127.0.0.1")
     assert "geheim" not in caught.value.message
+
+
+@pytest.mark.parametrize("proxy", ["foo://x:1", "http://x:one"])
+def test_proxies_must_be_usable(proxy: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HTTP_PROXY", proxy)
+    with pytest.raises(ConfigError, match="HTTP_PROXY") as caught:
+        Client("http://10.0.0.7:8000")
+    assert caught.value.code == "proxy_invalid"
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,8 @@ class SlowStream:
     def send(self, **sent: Any) -> StreamAnswer:
         self.sent_at_s.append(self._clock.now_s())
         self._clock.wait(next(self._after_s))
-        return StreamAnswer((), (), session_id="one", begun=False, waiting_frames=0, detection_ids=None)
+        begun = len(self.sent_at_s) == 1
+        return StreamAnswer((), (), session_id="one", begun=begun, waiting_frames=0, detection_ids=None)
 
 
 @pytest.mark.parametrize("speed", [-1.0, 1e-4, 1e4, float("nan"), float("inf")])

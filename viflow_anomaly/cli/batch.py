@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from viflow_anomaly.cli.options import (
+    EXIT_SOME_FAILED,
     AsJson,
     Assignments,
     Calibration,
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from viflow_anomaly.datasets.recording import Recording
     from viflow_anomaly.settings import Settings
 
-EXIT_SOME_FAILED = 3
 MAX_DEFAULT_JOBS = 8
 """More processes than that only by ``--jobs``: each takes some 300 MB."""
 

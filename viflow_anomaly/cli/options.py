@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from viflow_anomaly.detector import AnomalyDetector
     from viflow_anomaly.settings import Settings
 
+EXIT_SOME_FAILED = 3
 BUNDLED = Path("default")
 """What ``--init`` calls the weights that come with the package."""
 ConfigFile = Annotated[

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import re
+import signal
 import sys
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from viflow_anomaly.cli.options import KeyFile
+from viflow_anomaly.cli.options import EXIT_SOME_FAILED, KeyFile
 from viflow_anomaly.cli.progress import stderr_progress
 
 if TYPE_CHECKING:
     from viflow_anomaly.client import StreamAnswer
+    from viflow_anomaly.detection import Reason
 
 LOCAL_SERVICE = "http://127.0.0.1:8000"
 MAX_STREAM_NAME = 64
@@ -36,11 +40,11 @@ def replay(
     ] = None,
     camera: Annotated[str | None, typer.Option(metavar="NAME", help="Which camera, e.g. cam1 or image_03.")] = None,
     keep: Annotated[bool, typer.Option("--keep", help="Leave the stream in the service at the end.")] = False,
-) -> None:
+) -> int:
     """Send a recording to a service, frame by frame, as its camera and IMU would have sent it.
 
     Prints a detection a line (ROI JSON) as they come. The service's dashboard shows the stream, and its events begin
-    and end. Needs the extra `client`.
+    and end. Exit code 3 when something of the recording was left out; stderr says what. Needs the extra `client`.
 
     [bold]Examples[/bold]
 
@@ -57,17 +61,33 @@ def replay(
     name, counted = _required_name(stream) or stream_name(recording.name), _Counted()
     key = None if key_file is None else read_api_key(key_file)
     try:
-        with stderr_progress() as progress, Client(url, api_key=key) as client:
+        with _ended_in_order(), stderr_progress() as progress, Client(url, api_key=key) as client:
             task = progress.add_task(name, total=len(recording))
             with client.stream(name, camera=recording.camera, keep=keep) as sending:
                 for answer in send_all(recording, sending, speed=speed):
                     for detection in answer:
                         print(to_json(detection), flush=True)
-                    counted.add(answer)
+                    for fault in counted.add(answer):
+                        print(f"{fault.code}: {fault.message}", file=sys.stderr)
                     progress.advance(task)
     finally:
         if counted.calls:
             print(f"{url}, stream {name}: {counted}", file=sys.stderr)
+    return 0 if counted.whole else EXIT_SOME_FAILED
+
+
+@contextmanager
+def _ended_in_order() -> Iterator[None]:
+    """Inside, SIGTERM ends the program as Ctrl-C does: the service is told to forget the stream."""
+
+    def end(number: int, frame: object) -> None:
+        raise SystemExit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 class _Counted:
@@ -75,36 +95,47 @@ class _Counted:
 
     def __init__(self) -> None:
         self.calls = 0
-        self._judged = self._moving = self._waiting = self._begun = self._lost = 0
+        self._judged = self._moving = self._abstained = self._waiting = self._begun = self._lost = 0
         self._left_out: Counter[str] = Counter()
 
-    def add(self, answer: StreamAnswer) -> None:
+    def add(self, answer: StreamAnswer) -> list[Reason]:
+        """The faults of kinds that were not there before."""
+        new = [fault for fault in answer.faults if fault.code not in self._left_out]
         self.calls += 1
         self._judged += len(answer)
         self._moving += sum(any(roi.label == "independent_motion" for roi in one.rois) for one in answer)
+        self._abstained += sum(one.status == "abstained" for one in answer)
         self._left_out.update(fault.code for fault in answer.faults)
         self._waiting = answer.waiting_frames
         self._begun += answer.begun
         self._lost += answer.answer_lost
+        return list({fault.code: fault for fault in reversed(new)}.values())
+
+    @property
+    def whole(self) -> bool:
+        """Nothing of the recording was left out."""
+        return not (self._left_out or self._waiting or self._lost or self._begun > 1)
 
     def __str__(self) -> str:
         parts = [f"{self._judged} pairs, in {self._moving} something moves by itself"]
+        if self._abstained:
+            parts.append(f"{self._abstained} could not be judged")
         if self._left_out:
             codes = (f"{count} x {code}" for code, count in sorted(self._left_out.items()))
             parts.append(f"left out: {', '.join(codes)}")
         if self._waiting:
-            parts.append(f"frames whose pair waits for IMU samples that the recording lacks: {self._waiting}")
+            parts.append(f"{self._waiting} frames wait for IMU samples that did not come")
         if self._begun > 1:
             parts.append(f"the service forgot the stream and began it anew {self._begun - 1} times")
         if self._lost:
-            parts.append(f"answers that were lost on their way: {self._lost}")
+            parts.append(f"{self._lost} answers were lost on their way")
         return "; ".join(parts)
 
 
 def stream_name(recording: str) -> str:
     """The recording's name with what a stream's name may not hold replaced."""
     name = re.sub(r"[^A-Za-z0-9._-]+", "-", recording)[:MAX_STREAM_NAME]
-    return "recording" if not name.strip(".") else name
+    return "recording" if name in ("", ".", "..") else name
 
 
 def _required_name(stream: str | None) -> str | None:

@@ -29,7 +29,7 @@ class AsyncClient(Calling):
         retries: RetryPolicy | None = None,
     ) -> None:
         super().__init__(base_url, api_key=api_key, timeout_s=timeout_s, retries=retries)
-        self._http = self._httpx.AsyncClient(**self._options)
+        self._http = self._opened(self._httpx.AsyncClient)
 
     async def __aenter__(self) -> Self:
         return self
@@ -112,7 +112,7 @@ class AsyncClient(Calling):
         attempts = attempts or Attempts(self._policy)
         while True:
             try:
-                return self._body(await self._http.request(call.method, call.path, files=call.files))
+                return self._body(await self._http.request(call.method, call.path, **call.options))
             except self._httpx.RequestError as err:
                 wait_s = attempts.wait_after(self._unreachable(err))
             except ServiceError as err:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final, Self
 from urllib.parse import urlsplit
 
@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 DEFAULT_TIMEOUT_S: Final = 60.0
 CONNECT_TIMEOUT_S: Final = 10.0
-_HOST: Final = re.compile(r"[A-Za-z0-9_-]([A-Za-z0-9._-]*)|[0-9a-fA-F:.]+(%[A-Za-z0-9._-]+)?", re.ASCII)
+_LABEL: Final = "[A-Za-z0-9_-]{1,63}"
+_HOST: Final = re.compile(rf"{_LABEL}(\.{_LABEL})*\.?|[0-9a-fA-F.]*:[0-9a-fA-F:.]*(%[A-Za-z0-9._-]+)?", re.ASCII)
 NO_RETRY: Final = RetryPolicy(attempts=1)
 
 
@@ -56,6 +57,16 @@ class Calling:
             headers["Authorization"] = f"Bearer {require_api_key(api_key, 'api_key')}"
         timeout = self._httpx.Timeout(timeout_s, connect=min(timeout_s, CONNECT_TIMEOUT_S))
         self._options: dict[str, Any] = {"base_url": self._base_url, "headers": headers, "timeout": timeout}
+
+    def _opened(self, make: Callable[..., Any]) -> Any:
+        try:
+            return make(**self._options)
+        except (ValueError, ImportError, self._httpx.InvalidURL) as err:
+            raise ConfigError(
+                f"expected proxies that can be used in HTTP_PROXY, HTTPS_PROXY and ALL_PROXY, found: {err!s:.200}",
+                code="proxy_invalid",
+                field="url",
+            ) from err
 
     def _detect_call(
         self, pair: FramePair | EncodedPair, include_masks: bool, regions: Mapping[str, Any] | None
@@ -99,7 +110,7 @@ class Client(Calling):
         retries: see ``RetryPolicy``.
 
     Raises:
-        ConfigError: ``service_url_invalid``, ``api_key_invalid``, ``timeout_invalid``.
+        ConfigError: ``service_url_invalid``, ``api_key_invalid``, ``timeout_invalid``, ``proxy_invalid``.
         MissingDependencyError: ``httpx_missing``.
     """
 
@@ -112,7 +123,7 @@ class Client(Calling):
         retries: RetryPolicy | None = None,
     ) -> None:
         super().__init__(base_url, api_key=api_key, timeout_s=timeout_s, retries=retries)
-        self._http = self._httpx.Client(**self._options)
+        self._http = self._opened(self._httpx.Client)
 
     def __enter__(self) -> Self:
         return self
@@ -168,7 +179,8 @@ class Client(Calling):
             camera: of all frames.
             model: one of ``models()["loaded"]``, as ``name`` or ``name@version``; None: the service's default.
             include_masks, regions: as for ``detect``.
-            keep: leave the stream to the service when the block ends, for somebody who goes on with it.
+            keep: leave the stream to the service when the block ends, for somebody who goes on with it; one that was
+                there before the block is left in any case.
         """
         options = stream_options(model, include_masks, regions)
         return ClientStream(
@@ -219,7 +231,7 @@ class Client(Calling):
         attempts = attempts or Attempts(self._policy)
         while True:
             try:
-                return self._body(self._http.request(call.method, call.path, files=call.files))
+                return self._body(self._http.request(call.method, call.path, **call.options))
             except self._httpx.RequestError as err:
                 wait_s = attempts.wait_after(self._unreachable(err))
             except ServiceError as err:
@@ -241,7 +253,7 @@ def _checked_url(text: str) -> str:
     try:
         parts = urlsplit(text)
         host, secret, _ = parts.hostname or "", parts.username or parts.password, parts.port
-        usable = _HOST.fullmatch(host) is not None
+        usable = _HOST.fullmatch(host) is not None and text.isprintable() and " " not in text
     except ValueError:
         secret, usable, parts = None, False, urlsplit("")
     if parts.scheme not in ("http", "https") or not usable or secret or parts.query or parts.fragment:

@@ -87,6 +87,15 @@ def _part(samples: ImuSamples, rows: slice) -> ImuSamples:
     return ImuSamples(samples.timestamps_ns[rows], samples.gyro_rad_s[rows], accel_m_s2)
 
 
+def _taken() -> ConfigError:
+    return ConfigError(
+        "stream: expected a name that the service does not know yet, found that of a stream that goes on there; choose "
+        "another, or have it forgotten (DELETE /streams/NAME)",
+        code="stream_taken",
+        field="stream",
+    )
+
+
 def replay(
     recording: Recording,
     stream: ClientStream,
@@ -108,12 +117,17 @@ def replay(
         now_s, wait: a clock and how to wait for it, in seconds.
 
     Raises:
-        ConfigError: ``speed_out_of_range``.
+        ConfigError: ``speed_out_of_range``; ``stream_taken`` where the service knew the stream before.
+        DatasetError: ``recording_too_short``.
         ServiceError: as ``ClientStream.send``.
     """
     if speed and not SLOWEST <= speed <= FASTEST:
         raise ConfigError(
             f"speed: expected 0 or {SLOWEST} to {FASTEST:.0f}, found {speed}", code="speed_out_of_range", field="speed"
+        )
+    if len(recording) < 2:
+        raise DatasetError(
+            f"{recording.root}: expected at least 2 frames, found {len(recording)}", code="recording_too_short"
         )
     began_s, first_ns = now_s(), int(recording.frame_timestamps_ns[0])
     answer = StreamAnswer((), (), session_id="", begun=False, waiting_frames=0, detection_ids=None)
@@ -124,6 +138,8 @@ def replay(
         if call.frame is None and call.imu is None:
             answer = replace(answer, detections=(), faults=call.left_out, begun=False, answer_lost=False)
         else:
-            answer = stream.send(frame=call.frame, imu=call.imu)
+            answer, is_first = stream.send(frame=call.frame, imu=call.imu), not answer.session_id
+            if is_first and not answer.begun:
+                raise _taken()
             answer = replace(answer, faults=(*call.left_out, *answer.faults))
         yield answer

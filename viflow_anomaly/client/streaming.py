@@ -18,6 +18,8 @@ from viflow_anomaly.detection_reading import detection_from_json
 from viflow_anomaly.errors import InvalidInputError
 from viflow_anomaly.sensor_data import Frame, ImuSamples, PinholeCamera
 
+FORGET_TIMEOUT_S: Final = 5.0
+"""Whoever has finished, or pressed Ctrl-C, does not wait for a service that hangs."""
 _REPEATED: Final = frozenset({"frame_duplicate", "imu_duplicate"})
 
 Ask = Callable[[ServiceCall, Attempts], bytes]
@@ -71,6 +73,7 @@ class _Streaming:
         self._url = url
         self._path = f"/streams/{quote(stream_id, safe='')}"
         self._policy = policy
+        self._begun = False
         # Said with every call: a stream that was forgotten meanwhile begins again with the same.
         self._setup: dict[str, Any] = {"options": dict(options)} if options else {}
         if camera is not None:
@@ -95,6 +98,7 @@ class _Streaming:
         try:
             said = json.loads(body)
             ids = said["detection_ids"]
+            self._begun |= bool(said["begun"])
             faults = tuple(Reason(**fault) for fault in said["faults"])
             return StreamAnswer(
                 detections=tuple(detection_from_json(json.dumps(one)) for one in said["detections"]),
@@ -113,7 +117,7 @@ class _Streaming:
             ) from err
 
     def _end(self) -> ServiceCall:
-        return ServiceCall("DELETE", self._path)
+        return ServiceCall("DELETE", self._path, timeout_s=FORGET_TIMEOUT_S)
 
 
 class ClientStream(_Streaming):
@@ -128,7 +132,7 @@ class ClientStream(_Streaming):
         return self
 
     def __exit__(self, *failure: object) -> None:
-        if not self._keep:
+        if self._begun and not self._keep:
             self.forget()
 
     def send(self, *, frame: Frame | EncodedFrame | None = None, imu: ImuSamples | None = None) -> StreamAnswer:
@@ -163,7 +167,7 @@ class AsyncClientStream(_Streaming):
         return self
 
     async def __aexit__(self, *failure: object) -> None:
-        if not self._keep:
+        if self._begun and not self._keep:
             await self.forget()
 
     async def send(self, *, frame: Frame | EncodedFrame | None = None, imu: ImuSamples | None = None) -> StreamAnswer:
