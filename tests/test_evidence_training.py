@@ -203,6 +203,15 @@ def test_a_training_goes_on_from_a_heads_weights(tmp_path: Path, detector: Anoma
     for name, weights in before.head.state_dict().items():
         torch.testing.assert_close(after.head.state_dict()[name], weights, rtol=0, atol=1e-9)
     assert after.record.provenance["init"]["sha256"] == before.record.sha256
+    shared = SMALL.model_copy(update={"init_share": 0.25})
+    whole = train_evidence(data, tmp_path / "whole", training=SMALL, init=first, **settings)  # type: ignore[arg-type]
+    between = train_evidence(data, tmp_path / "between", training=shared, init=first, **settings)  # type: ignore[arg-type]
+    trained, mean = (load_evidence_head(one).head.state_dict() for one in (whole, between))
+    for name, weights in before.head.state_dict().items():
+        torch.testing.assert_close(mean[name], 0.25 * weights + 0.75 * trained[name])
+    with pytest.raises(ConfigError) as caught:
+        train_evidence(data, tmp_path / "none", training=shared, **settings)  # type: ignore[arg-type]
+    assert (caught.value.code, caught.value.field) == ("config_invalid", "evidence_training.init_share")
     with pytest.raises(ConfigError) as caught:
         train_evidence(data, tmp_path / "second", training=still, resume=True, **settings)  # type: ignore[arg-type]
     assert (caught.value.code, caught.value.field) == ("resume_config_differs", "init")

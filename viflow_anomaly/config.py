@@ -416,6 +416,12 @@ class EvidenceTrainingConfig(FrozenConfig):
     own_size_share: float = Field(
         default=0.5, ge=0, le=1, description="recordings with all their pixels, not at the internal size"
     )
+    init_share: float = Field(
+        default=0.0,
+        ge=0,
+        lt=1,
+        description="of the weights of --init in those of the finished head",
+    )
     crop_width: int = Field(default=224, ge=32, le=8192, multiple_of=32)
     crop_height: int = Field(default=128, ge=32, le=8192, multiple_of=32)
     every: PositiveInt = Field(default=1, description="take every n-th pair of a recording")

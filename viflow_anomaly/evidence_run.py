@@ -22,6 +22,7 @@ from viflow_anomaly.evidence_augmentation import Augment
 from viflow_anomaly.evidence_cues import CUES_VERSION, GEOMETRIC_CUES, PHOTOMETRIC_CUES
 from viflow_anomaly.evidence_data import EvidenceData, cues_settings, load_examples
 from viflow_anomaly.evidence_training import EvidenceTraining, Fingerprint
+from viflow_anomaly.model.evidence_head import EvidenceHead
 from viflow_anomaly.region_score_fit import fit_region_score, labelled_regions
 from viflow_anomaly.runtime.loading import LoadedEvidence
 from viflow_anomaly.runtime.torch_evidence import TorchEvidence
@@ -61,12 +62,18 @@ def train_evidence(
 
     Raises:
         ConfigError: ``training_exists``, ``output_unusable``, ``resume_config_differs``, ``device_unavailable``,
-            ``training_diverged``, ``init_model_differs``; ``calibration_trained_on`` where a recording is in both
-            lists.
+            ``training_diverged``, ``init_model_differs``; ``config_invalid`` for an ``init_share`` without ``init``;
+            ``calibration_trained_on`` where a recording is in both lists.
         DatasetError: as ``load_examples`` and ``labelled_regions``.
         CheckpointError: ``checkpoint_corrupt`` for the state to go on from; as ``load_evidence_head`` for ``init``.
     """
     require_device(device)
+    if init is None and training.init_share:
+        raise ConfigError(
+            f"evidence_training.init_share: expected 0 where no weights are begun with, found {training.init_share}",
+            code="config_invalid",
+            field="evidence_training.init_share",
+        )
     initial = None if init is None else read_initial_head(init, training.head)
     if initial is not None:
         training = training.model_copy(update={"head": initial.record.head})
@@ -99,7 +106,8 @@ def train_evidence(
     record = _record(training, detector.model_info, data, calibration)
     if initial is not None:
         record = _with_provenance(record, init=origin_of(initial.record))
-    head = LoadedEvidenceHead(run.network.eval(), record)
+    network = run.network if initial is None else _between(initial.head, run.network, training.init_share)
+    head = LoadedEvidenceHead(network.eval(), record)
     return _with_scores(head, out_dir / "evidence.safetensors", detector, calibration, report, device=device)
 
 
@@ -134,6 +142,18 @@ def refit_scores(
     loaded = load_evidence_head(head)
     record = _with_provenance(loaded.record, scores_commit=source_commit(), calibration=_told(calibration))
     return _with_scores(loaded._replace(record=record), out, detector, calibration, report)
+
+
+def _between(initial: EvidenceHead, trained: EvidenceHead, share: float) -> EvidenceHead:
+    """``trained``, changed: each weight the mean of before and after the training, ``share`` of it before.
+
+    What lies between two heads of one origin judges other scenes better than either (Wortsman et al., Robust
+    fine-tuning of zero-shot models, CVPR 2022).
+    """
+    before, after = initial.state_dict(), trained.state_dict()
+    mean = {key: torch.lerp(value, before[key].to(value.device), share) for key, value in after.items()}
+    trained.load_state_dict(mean)
+    return trained
 
 
 def _run_steps(
