@@ -213,9 +213,9 @@ class RegionConfig(FrozenConfig):
     """From evidence to labelled regions; see ``regions`` and ``moving_regions`` for each step.
 
     Fractions are of the image diagonal unless the name says otherwise; the residual is in gray levels 0-255.
-    Regions of learned evidence (``moving_regions``) know ``min_motion_probability``, ``faint_motion_probability`` and
-    ``min_motion_extent_fraction`` in place of ``threshold_mads``, ``min_residual_gray``, smoothing, opening, closing
-    and the smallest extents in x and in y.
+    Regions of learned evidence (``moving_regions``) know ``min_motion_probability``, ``faint_motion_probability``,
+    ``min_motion_extent_fraction`` and ``min_score`` in place of ``threshold_mads``, ``min_residual_gray``, smoothing,
+    opening, closing and the smallest extents in x and in y.
     """
 
     texture_softening_gray: float = Field(
@@ -250,6 +250,9 @@ class RegionConfig(FrozenConfig):
         default=0.008, ge=0, le=1, description="of the diagonal, with learned evidence: narrower in x or y is a band"
     )
     max_aspect_ratio: float = Field(default=5.0, ge=1, description="a longer bounding box is a band")
+    min_score: float = Field(
+        default=0.01, ge=0, le=0.5, description="with learned evidence: a region that scores less is not told"
+    )
     motion_score: float = Field(
         default=0.5, ge=0.5, le=1.01, description="independent_motion scores at least this; above 1: nothing does"
     )

@@ -139,9 +139,10 @@ def find_moving_regions(
         score: as fitted for this head.
 
     Returns:
-        Highest score first, ties by y then x.
+        Highest score first, ties by y then x; none below ``config.min_score``.
     """
-    regions = [_judge(one, residual, score, config) for one in measure_regions(maps, cues, inside, config)]
+    judged = (_judge(one, residual, score, config) for one in measure_regions(maps, cues, inside, config))
+    regions = [region for region in judged if region.score >= config.min_score]
     return sorted(regions, key=lambda region: (-region.score, region.bbox.y, region.bbox.x))
 
 
