@@ -303,6 +303,8 @@ def test_the_folder_of_calibration_must_be_one(tmp_path: Path) -> None:
     for name, found in (("missing", "nothing there"), ("file", "a file")):
         with pytest.raises(DatasetError, match=f"expected a folder of recordings.*{found}"):
             recordings_in(tmp_path / name)
+    one = recording(tmp_path / "some" / "drone_1")
+    assert recordings_in(one) == recordings_in(tmp_path / "some") == [one]
 
 
 def test_scores_need_regions(tmp_path: Path, detector: AnomalyDetector) -> None:

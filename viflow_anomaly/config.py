@@ -251,7 +251,7 @@ class RegionConfig(FrozenConfig):
     )
     max_aspect_ratio: float = Field(default=5.0, ge=1, description="a longer bounding box is a band")
     min_score: float = Field(
-        default=0.01, ge=0, le=0.5, description="with learned evidence: a region that scores less is not told"
+        default=0.001, ge=0, le=0.5, description="with learned evidence: a region that scores less is not told"
     )
     motion_score: float = Field(
         default=0.5, ge=0.5, le=1.01, description="independent_motion scores at least this; above 1: nothing does"

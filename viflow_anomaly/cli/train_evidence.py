@@ -97,7 +97,8 @@ def train_evidence(
 
 
 def recordings_in(folder: Path) -> list[Path]:
-    """Its sub-folders by name; hidden ones, such as a simulation that is still being written, are none.
+    """Its sub-folders by name; hidden ones, such as a simulation that is still being written, are none. A simulated
+    recording is one by itself, not a folder of some.
 
     Raises:
         DatasetError: ``directory_missing``.
@@ -109,6 +110,8 @@ def recordings_in(folder: Path) -> list[Path]:
             code="directory_missing",
             field="calibration",
         )
+    if (folder / "mav0").is_dir():
+        return [folder]
     return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
 
 
