@@ -248,6 +248,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "latency.json")
     parser.add_argument("--repeats", type=int, default=200, help=f"at least {MIN_REPEATS} (default 200)")
     parser.add_argument("--warm-up", type=int, default=20, help="untimed repetitions of each case (default 20)")
+    parser.add_argument("--cameras", nargs="+", choices=CAMERAS, default=CAMERAS)
     arguments = parser.parse_args()
     if arguments.repeats < MIN_REPEATS or arguments.warm_up < 1:
         parser.error(f"expected at least {MIN_REPEATS} repeats and 1 warm-up")
@@ -275,7 +276,7 @@ def main() -> None:
     stages = Stages(arguments.checkpoint, detector, arguments.runtime)
     results = []
     for width, height in SIZES:
-        for camera in CAMERAS:
+        for camera in arguments.cameras:
             case = make_case(sample, width, height, camera)
             results.append(measure(case, detector, stages, repeats=arguments.repeats, warm_up=arguments.warm_up))
     about = circumstances(detector, load_before)

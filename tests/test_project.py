@@ -181,26 +181,3 @@ def test_the_recipe_replaces_the_model_that_is_loaded() -> None:
     assert kinds == {".safetensors", ".json", ".onnx", ".md"}
     assert load_checkpoint().record.sha256 in (weights / f"{BUNDLED_NAME}.md").read_text(encoding="utf-8")
     assert load_runtime(None).record.name == BUNDLED_NAME
-
-
-@pytest.mark.parametrize("script", sorted(path.name for path in (ROOT / "benchmarks").glob("*.py")))
-def test_every_benchmark_starts(script: str) -> None:
-    done = subprocess.run(
-        [sys.executable, ROOT / "benchmarks" / script, "--help"], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("usage: ")
-
-
-@pytest.mark.parametrize(("script", "repeats"), [("latency.py", 50), ("pair_profile.py", 10)])
-def test_what_clocks_parts_of_a_detection_runs_through(script: str, repeats: int, tmp_path: Path) -> None:
-    """They call what ``detect`` calls part by part, and types say nothing of scripts; how long it takes is no matter
-    here."""
-    out = tmp_path / "report.json"
-    command = [sys.executable, ROOT / "benchmarks" / script, "--repeats", str(repeats), "--warm-up", "1", "--out", out]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert {(case["width"], case["height"]) for case in json.loads(out.read_text())["results"]} == {
-        (224, 224),
-        (752, 480),
-    }
