@@ -17,7 +17,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -66,14 +66,18 @@ class Variant(NamedTuple):
         return f"{self.runtime} {self.precision}"
 
 
-VARIANTS = (
-    Variant("openvino", "f32"),
-    Variant("openvino", "bf16"),
-    Variant("openvino", "int8"),
-    Variant("onnxruntime", "f32"),
-    Variant("onnxruntime", "int8"),
-    Variant("torch", "f32"),
-)
+@cache
+def variants() -> tuple[Variant, ...]:
+    """bfloat16 only where the CPU computes in it."""
+    has_bfloat16 = load_evidence(None, runtime="openvino", precision="auto").runtime.backend.precision == "bf16"
+    return (
+        Variant("openvino", "f32"),
+        *([Variant("openvino", "bf16")] if has_bfloat16 else []),
+        Variant("openvino", "int8"),
+        Variant("onnxruntime", "f32"),
+        Variant("onnxruntime", "int8"),
+        Variant("torch", "f32"),
+    )
 
 
 class Files(NamedTuple):
@@ -110,7 +114,7 @@ def measure_latency(files: Files, *, repeats: int, warm_up: int) -> list[dict[st
         pair = make_case(sample, width, height, "pinhole").pair
         given, (cues, _) = prepare(pair, model), detector.cues(detector.as_judged(pair, for_head=True))
         calls: dict[str, dict[str, Callable[[], object]]] = {"network": {}, "evidence head": {}}
-        for one in VARIANTS:
+        for one in variants():
             network = load_runtime(files.network, runtime=one.runtime, precision=one.precision, threads=1).runtime
             head = load_evidence(files.head, runtime=one.runtime, precision=one.precision, threads=1).runtime
             calls["network"][str(one)] = partial(network.predict, given)
@@ -137,8 +141,8 @@ def _in_turns(calls: Mapping[str, Callable[[], object]], *, repeats: int, warm_u
 def detector_variants(files: Files) -> dict[str, AnomalyDetector]:
     """Both in float32 in each runtime, then either one in each other precision."""
     exact: Precision = "f32"
-    wanted = {f"{one}": (one.runtime, exact, exact) for one in VARIANTS if one.precision == exact}
-    for one in VARIANTS:
+    wanted = {f"{one}": (one.runtime, exact, exact) for one in variants() if one.precision == exact}
+    for one in variants():
         if one.precision != exact:
             wanted[f"{one}, evidence head"] = (one.runtime, exact, one.precision)
             wanted[f"{one}, network"] = (one.runtime, one.precision, exact)
@@ -173,7 +177,7 @@ def measure_flow(files: Files, recordings: Sequence[Path], every: int) -> dict[s
     """``evaluate flow`` of the network in every variant: mean endpoint error by group and variant, px."""
     truths = open_truths(recordings, [1], None, movers=True)
     methods = []
-    for one in VARIANTS:
+    for one in variants():
         loaded = load_runtime(files.network, runtime=one.runtime, precision=one.precision, threads=1)
         methods += network_methods(str(one), loaded.runtime, loaded.record, CorrectionConfig())
     pairs = sum(len(truth) for truth in truths)
@@ -211,10 +215,10 @@ def losses(regions: Mapping[str, Any], flow: Mapping[str, Any]) -> dict[str, Any
 
 def markdown(report: Mapping[str, Any]) -> str:
     """The tables of docs/runtimes.md."""
-    variants = [str(one) for one in VARIANTS]
-    lines = [f"| ms (ratio) | image | sees | {' | '.join(variants)} |", "|---|---|---|" + "---|" * len(variants)]
+    names = [str(one) for one in variants()]
+    lines = [f"| ms (ratio) | image | sees | {' | '.join(names)} |", "|---|---|---|" + "---|" * len(names)]
     for row in report["latency"]:
-        cells = [f"{row['ms'][one]['median']:.2f} ({row['ms'][one]['ratio']:.2f})" for one in variants]
+        cells = [f"{row['ms'][one]['median']:.2f} ({row['ms'][one]['ratio']:.2f})" for one in names]
         lines.append(f"| {row['part']} | {row['image']} | {row['sees']} | {' | '.join(cells)} |")
     scopes_ = list(report["regions"])
     heads = [f"{key} {scope}" for scope in scopes_ for key in DETECTION_FIGURES]
