@@ -67,10 +67,11 @@ def test_one_frame_is_no_recording(ask: Ask, pair: PairFolder, service: LiveServ
 
 def test_a_terminated_replay_has_its_stream_forgotten(pair: PairFolder, service: LiveServer) -> None:
     code = "from viflow_anomaly.cli.main import main; main()"
-    place = ["--url", f"http://127.0.0.1:{service.port}", "--stream", "ended", "--speed", "0.002"]
+    place = ["--url", f"http://127.0.0.1:{service.port}", "--stream", "ended", "--speed", "0.02"]
     command = [sys.executable, "-c", code, "replay", str(pair.folder), *place]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as running:
-        wait_until(lambda: service.client.get("/streams/ended").status_code == 200, seconds=60)
+        # With a second frame there, the answer to the first, which tells whose stream it is, has been read.
+        wait_until(lambda: service.client.get("/streams/ended").json().get("received_frames", 0) >= 2, seconds=60)
         running.terminate()
         assert running.wait(timeout=60) == 128 + signal.SIGTERM
     assert service.client.get("/streams/ended").status_code == 404
