@@ -16,9 +16,11 @@ from viflow_anomaly.cli.options import (
     AsJson,
     Assignments,
     Calibration,
+    CameraName,
     Checkpoint,
     ConfigFile,
     Device,
+    RecordingFolder,
     Runtime,
     Threads,
     load_detector,
@@ -45,9 +47,7 @@ def _how_many(text: str) -> str:
 
 
 def batch(
-    directory: Annotated[
-        Path, typer.Argument(metavar="DIR", help="EuRoC ASL, KITTI raw, KITTI odometry or the plain layout.")
-    ],
+    directory: RecordingFolder,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: DIR-detections", show_default=False)] = None,
     layout: Annotated[
         str | None,
@@ -57,7 +57,7 @@ def batch(
             help="euroc, kitti_raw, kitti_odometry, kitti_odometry_raw or plain; default by content.",
         ),
     ] = None,
-    camera: Annotated[str | None, typer.Option(metavar="NAME", help="Which camera, e.g. cam1 or image_03.")] = None,
+    camera: CameraName = None,
     look_ahead: Annotated[int, typer.Option(min=1, max=4, help="Frames from source to target.")] = 1,
     limit: Annotated[int | None, typer.Option(min=1, metavar="N", help="Only the first N pairs.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Do only what an earlier run left out.")] = False,

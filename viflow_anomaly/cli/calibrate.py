@@ -11,6 +11,7 @@ import typer
 from viflow_anomaly.cli.options import (
     AsJson,
     Assignments,
+    CameraName,
     Checkpoint,
     ConfigFile,
     Device,
@@ -64,7 +65,7 @@ def calibrate(
     layout: Annotated[
         str | None, typer.Option("--format", metavar="NAME", help="As for `batch`; default by content.")
     ] = None,
-    camera: Annotated[str | None, typer.Option(metavar="NAME", help="Which camera, e.g. cam1 or image_03.")] = None,
+    camera: CameraName = None,
     as_json: AsJson = False,
     checkpoint: Checkpoint = None,
     threads: Threads = None,

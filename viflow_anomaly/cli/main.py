@@ -1,6 +1,7 @@
 """Entry point: the commands, and the one place where an error becomes a line on stderr and an exit code.
 
-Exit codes: 0 done, 2 bad usage or input, 3 some pairs of a batch failed, 130 interrupted.
+Exit codes: 0 done, 2 bad usage or input, 3 some pairs of a batch failed or a replay left something out, 130
+interrupted.
 """
 
 from __future__ import annotations

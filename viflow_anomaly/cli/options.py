@@ -49,6 +49,10 @@ Runtime = Annotated[
     str | None, typer.Option(metavar="NAME", help="auto (default), openvino, onnxruntime or torch: docs/runtimes.md.")
 ]
 KeyFile = Annotated[Path | None, typer.Option(metavar="FILE", help="A file that holds the API key for --url.")]
+RecordingFolder = Annotated[
+    Path, typer.Argument(metavar="DIR", help="EuRoC ASL, KITTI raw, KITTI odometry or the plain layout.")
+]
+CameraName = Annotated[str | None, typer.Option(metavar="NAME", help="Which camera, e.g. cam1 or image_03.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on stdout, and nothing else there.")]
 
 

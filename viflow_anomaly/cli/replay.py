@@ -8,12 +8,11 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from viflow_anomaly.cli.options import EXIT_SOME_FAILED, KeyFile
+from viflow_anomaly.cli.options import EXIT_SOME_FAILED, CameraName, KeyFile, RecordingFolder
 from viflow_anomaly.cli.progress import stderr_progress
 
 if TYPE_CHECKING:
@@ -25,9 +24,7 @@ MAX_STREAM_NAME = 64
 
 
 def replay(
-    directory: Annotated[
-        Path, typer.Argument(metavar="DIR", help="EuRoC ASL, KITTI raw, KITTI odometry or the plain layout.")
-    ],
+    directory: RecordingFolder,
     url: Annotated[str, typer.Option(metavar="URL", help="Of the service.")] = LOCAL_SERVICE,
     stream: Annotated[
         str | None,
@@ -38,7 +35,7 @@ def replay(
     layout: Annotated[
         str | None, typer.Option("--format", metavar="NAME", help="As of `batch`; default by content.")
     ] = None,
-    camera: Annotated[str | None, typer.Option(metavar="NAME", help="Which camera, e.g. cam1 or image_03.")] = None,
+    camera: CameraName = None,
     keep: Annotated[bool, typer.Option("--keep", help="Leave the stream in the service at the end.")] = False,
 ) -> int:
     """Send a recording to a service, frame by frame, as its camera and IMU would have sent it.
